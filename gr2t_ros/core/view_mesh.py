@@ -1,0 +1,102 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The mesh of one view: its pixel grid as vertices, edges and faces with likelihoods."""
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .exact_density import ExactDensity
+from .ray_march import Rays
+
+ROBUST_MAXIMUM = 98.0  # percentile of the likelihoods that thresholds and colours refer to
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMesh:
+    """
+    A triangle mesh whose vertices and edges carry likelihoods (1 / (px^2 m)).
+
+    :param vertices: (n, 3) float64, world, metres
+    :param vertex_likelihood: (n,) float32
+    :param faces: (m, 3) int32, indices of vertices, anticlockwise as the camera sees them
+    :param edges: (k, 2) int32, indices of vertices; each edge once
+    :param edge_likelihood: (k,) float32, at the edges' barycentres
+    """
+
+    vertices: NDArray[np.float64]
+    vertex_likelihood: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    edge_likelihood: NDArray[np.float32]
+
+
+def view_mesh(
+    density: ExactDensity,
+    rays: Rays,
+    width: int,
+    stride: int,
+    min_likelihood: float,
+    min_edge_likelihood: float,
+    pool: Executor | None = None,
+) -> ViewMesh:
+    """
+    Join the maxima of a view's rays to a mesh and cut it where it is unlikely.
+
+    Neighbours i, i+1 over j, j+1 give the edges (i, i+1), (j, j+1), (i, j), (i+1, j+1), (i, j+1)
+    and two triangles (Grogan & Dahyot 2014). A removed vertex or edge takes its faces with it: the
+    middle of an edge across a depth discontinuity lies in empty space, and so is unlikely.
+
+    :param width: of the view's image, pixels
+    :param stride: use every stride-th pixel of every stride-th row
+    :param min_likelihood: least vertex, as a fraction of the 98th percentile
+    :param min_edge_likelihood: least edge, as a fraction of the larger of its two vertices
+    """
+    count = density.views.count
+    likelihood = rays.total / np.float32(max(count, 1))
+    kept = rays.converged
+    if kept.any():
+        # not in place: `converged` is made anew, but who reads this should not have to know
+        kept = kept & (
+            likelihood >= min_likelihood * np.percentile(likelihood[kept], ROBUST_MAXIMUM))
+    v, u = np.divmod(rays.pixels, width)
+    kept = kept & (v % stride == 0) & (u % stride == 0)
+    likelihood = likelihood[kept]
+    vertices = rays.origin + rays.depth[kept, None].astype(np.float64) * rays.direction[kept]
+
+    v, u = v[kept] // stride, u[kept] // stride
+    grid = np.full((v.max(initial=0) + 2, u.max(initial=0) + 2), -1, np.int32)
+    grid[v, u] = np.arange(len(vertices), dtype=np.int32)
+    corner, right = grid[:-1, :-1], grid[:-1, 1:]
+    below, opposite = grid[1:, :-1], grid[1:, 1:]
+
+    def edges_to(other: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+        exists = (corner >= 0) & (other >= 0)
+        pairs = np.column_stack([corner[exists], other[exists]])
+        middle = density.likelihood(
+            0.5 * (vertices[pairs[:, 0]] + vertices[pairs[:, 1]]), pool).astype(np.float32)
+        likely = middle >= min_edge_likelihood * likelihood[pairs].max(axis=1, initial=0)
+        return pairs[likely], middle[likely]
+
+    (across, across_likelihood), (down, down_likelihood), (diagonal, diagonal_likelihood) = (
+        edges_to(right), edges_to(below), edges_to(opposite))
+
+    def present(pairs: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Mark the grid places at which an edge of one of the three kinds begins."""
+        marks = np.zeros(grid.shape, np.bool_)
+        marks[v[pairs[:, 0]], u[pairs[:, 0]]] = True
+        return marks
+
+    has_across, has_down, has_diagonal = present(across), present(down), present(diagonal)
+    lower = has_diagonal[:-1, :-1] & has_down[:-1, :-1] & has_across[1:, :-1]
+    upper = has_diagonal[:-1, :-1] & has_across[:-1, :-1] & has_down[:-1, 1:]
+    faces = np.concatenate([
+        np.column_stack([corner[lower], below[lower], opposite[lower]]),
+        np.column_stack([corner[upper], opposite[upper], right[upper]])])
+    return ViewMesh(
+        vertices, likelihood, faces,
+        np.concatenate([across, down, diagonal]),
+        np.concatenate([across_likelihood, down_likelihood, diagonal_likelihood]))

@@ -1,0 +1,170 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Every parameter once: name, default, unit, range and help.
+
+The node's declarations, the YAML files and the command line's `-p name:=value` are all made from
+this table.
+"""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import Field, dataclass, field, fields, replace
+import difflib
+from math import isfinite
+from typing import Any
+
+from .errors import InputError
+
+Value = bool | int | float | str
+
+
+def _parameter(
+    default: Value,
+    help: str,  # noqa: A002
+    *,
+    unit: str = '',
+    low: float | None = None,
+    high: float | None = None,
+    choices: tuple[str, ...] = (),
+) -> Any:
+    return field(
+        default=default,
+        metadata={'help': help, 'unit': unit, 'low': low, 'high': high, 'choices': choices},
+    )
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All parameters; a value outside its range raises InputError."""
+
+    # the density
+    pixel_bandwidth: float = _parameter(
+        1.5, 'Standard deviation h1 = h2 of the kernel across the image.',
+        unit='px', low=0.5, high=8.0)
+    depth_bandwidth: float = _parameter(
+        0.003, 'Standard deviation h3 of the kernel along the depth, at depth 0: about one '
+        'standard deviation of the sensor\'s noise.', unit='m', low=1e-5, high=1.0)
+    depth_bandwidth_quadratic: float = _parameter(
+        0.002, 'Growth of h3 with the square of the depth: h3(z) = depth_bandwidth + this z^2.',
+        unit='1/m', low=0.0, high=1.0)
+
+    # the rays and the meshes
+    start: str = _parameter(
+        'robust', 'Where a ray starts: at its observed depth, or (robust) at a neighbour\'s depth '
+        'where the observed one is an outlier.', choices=('robust', 'observed'))
+    ray_stride: int = _parameter(
+        1, 'March every n-th pixel of every n-th row.', unit='px', low=1, high=64)
+    min_likelihood: float = _parameter(
+        0.02, 'Vertices below this fraction of their view\'s 98th percentile are removed.',
+        low=0.0, high=1.0)
+    min_edge_likelihood: float = _parameter(
+        0.5, 'Edges whose middle has less than this fraction of the larger of their two '
+        'vertices\' likelihoods are removed.', low=0.0, high=1.0)
+    keyframe_translation: float = _parameter(
+        0.1, 'A frame this far from the last keyframe becomes one, and so owns a mesh.',
+        unit='m', low=0.0, high=100.0)
+    keyframe_rotation: float = _parameter(
+        0.17, 'A frame turned this far from the last keyframe becomes one.',
+        unit='rad', low=0.0, high=3.15)
+    max_keyframes: int = _parameter(
+        1000, 'Keyframes kept; later ones still add to the density (reported).',
+        low=1, high=1_000_000)
+    remarch_budget: float = _parameter(
+        0.1, 'Time per frame for marching older rays again; what is left waits, and is done before '
+        'a snapshot or at the end.', unit='s', low=0.0, high=60.0)
+    threads: int = _parameter(
+        0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
+
+    # the input
+    depth_min: float = _parameter(
+        0.1, 'Depths below are invalid.', unit='m', low=0.0, high=1000.0)
+    depth_max: float = _parameter(
+        5.0, 'Depths above are invalid.', unit='m', low=0.0, high=1000.0)
+    world_frame: str = _parameter(
+        '', 'Frame the map is built in; empty: the root of the tf tree above the camera, or the '
+        'pose topic\'s frame.')
+    pose_source: str = _parameter(
+        'tf', 'Where camera poses come from: /tf, or a message on the topic `pose`.',
+        choices=('tf', 'pose', 'pose_with_covariance', 'odometry', 'transform'))
+    max_wait_for_pose: float = _parameter(
+        1.0, 'An image that has no pose after this time is dropped, and counted.',
+        unit='s', low=0.0, high=60.0)
+    queue_size: int = _parameter(
+        10, 'Images that may wait for the worker; when full the oldest is dropped, and counted.',
+        low=1, high=1000)
+
+    # the output
+    colour_map: str = _parameter(
+        'turbo', 'Colours from low (blue) to high (red) likelihood.',
+        choices=('turbo', 'jet', 'coolwarm', 'viridis'))
+    publish_rate: float = _parameter(
+        2.0, 'Meshes published per second, at most.', unit='Hz', low=0.05, high=60.0)
+    display_stride: int = _parameter(
+        4, 'The published (not the saved) meshes use every n-th ray of every n-th row.',
+        unit='px', low=1, high=64)
+    snapshot_directory: str = _parameter(
+        '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.')
+    snapshot_on_exit: bool = _parameter(
+        False, 'Also save a snapshot when the node is told to stop.')
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            _check(item, getattr(self, item.name))
+        if self.depth_min >= self.depth_max:
+            raise InputError(
+                f'parameter depth_min ({self.depth_min:g} m) must be below depth_max '
+                f'({self.depth_max:g} m)')
+
+    def updated(self, values: Mapping[str, object]) -> Settings:
+        """
+        Return a copy with some values replaced.
+
+        :param values: name -> value, or its text as written in `name:=value`
+        :raises InputError: for an unknown name, a wrong type or a value out of range
+        """
+        known = {item.name: item for item in fields(self)}
+        parsed: dict[str, Any] = {}
+        for name, value in values.items():
+            if name not in known:
+                near = difflib.get_close_matches(name, known, n=1)
+                hint = f'; did you mean {near[0]}?' if near else f'; known: {", ".join(known)}'
+                raise InputError(f'unknown parameter {name}{hint}')
+            parsed[name] = _parse(known[name], value)
+        return replace(self, **parsed)
+
+
+def _parse(item: Field[Any], value: object) -> Value:
+    """Bring a value, or its text, to the type of the parameter's default."""
+    kind = type(item.default)
+    text = isinstance(value, str)
+    if kind is str and text:
+        return str(value)
+    if kind is bool:
+        if isinstance(value, bool):
+            return value
+        if text and str(value).lower() in ('true', 'false'):
+            return str(value).lower() == 'true'
+    elif kind in (int, float) and not isinstance(value, bool):
+        try:
+            number = float(value)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            number = float('nan')
+        if kind is float and isfinite(number):
+            return number
+        if kind is int and isfinite(number) and number == int(number):
+            return int(number)
+    names = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}
+    raise InputError(f'parameter {item.name} must be {names[kind]}, not {value!r}')
+
+
+def _check(item: Field[Any], value: Any) -> None:
+    meta = item.metadata
+    if meta['choices'] and value not in meta['choices']:
+        raise InputError(
+            f'parameter {item.name} must be one of {", ".join(meta["choices"])}, not {value!r}')
+    low, high = meta['low'], meta['high']
+    if low is not None and not low <= value <= high:
+        unit = f' {meta["unit"]}' if meta['unit'] else ''
+        raise InputError(
+            f'parameter {item.name} must lie in [{low:g}, {high:g}]{unit}, not {value!r}')
