@@ -9,7 +9,7 @@ this table.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import Field, dataclass, field, fields, replace
+from dataclasses import dataclass, Field, field, fields, replace
 import difflib
 from math import isfinite
 from typing import Any
@@ -71,8 +71,8 @@ class Settings:
         1000, 'Keyframes kept; later ones still add to the density (reported).',
         low=1, high=1_000_000)
     remarch_budget: float = _parameter(
-        0.1, 'Time per frame for marching older rays again; what is left waits, and is done before '
-        'a snapshot or at the end.', unit='s', low=0.0, high=60.0)
+        0.1, 'Time per frame for marching older rays again; what is left waits, and is done '
+        'before a snapshot or at the end.', unit='s', low=0.0, high=60.0)
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
 
@@ -136,7 +136,8 @@ class Settings:
 
 def _parse(item: Field[Any], value: object) -> Value:
     """Bring a value, or its text, to the type of the parameter's default."""
-    kind = type(item.default)
+    default: Any = item.default
+    kind = type(default)
     text = isinstance(value, str)
     if kind is str and text:
         return str(value)

@@ -21,7 +21,14 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .camera import project_jet
 from .kernel import (
-    axis_weights, Floats, INVALID_DEPTH, RESIDUAL_SCALE, Window, window_jet, window_value)
+    axis_weights,
+    Floats,
+    INVALID_DEPTH,
+    RESIDUAL_SCALE,
+    Window,
+    window_jet,
+    window_value,
+)
 from .view import View
 
 Doubles = NDArray[np.float64]
@@ -35,7 +42,7 @@ class Views(NamedTuple):
     """
     The views as the kernels read them.
 
-    :param count: number of views; the arrays may be longer
+    :param size: number of views; the arrays may be longer
     :param T_camera_world: (c, 3, 4)
     :param camera: (c, 14) Camera.parameters
     :param layout: (c, 7): first pixel of the padded image, its row stride, first cell, cells in a
@@ -45,7 +52,7 @@ class Views(NamedTuple):
     :param near: flat cells: least depth at which one of the window's kernels counts; far: largest
     """
 
-    count: int
+    size: int
     T_camera_world: Doubles
     camera: Doubles
     layout: NDArray[np.int64]
@@ -118,7 +125,7 @@ class ExactDensity:
         precision = np.zeros_like(depth)
         precision[inside] = RESIDUAL_SCALE / self.h3(np.where(seen, view.depth, 0))
 
-        reach = int(ceil(self.window.reach))
+        reach = ceil(self.window.reach)
         cells_wide = (width + 2 * reach) // _CELL + 1
         near, far = _depth_ranges(
             depth, precision, before, reach, self.truncation * RESIDUAL_SCALE,
@@ -132,7 +139,7 @@ class ExactDensity:
         factor = 1.0 / (
             (2 * pi) ** 1.5 * h1 * h1 * RESIDUAL_SCALE * width * height)
 
-        v, c = self._views, self._views.count
+        v, c = self._views, self._views.size
         layout = np.array(
             [self._pixels, stride, self._cells, cells_wide, before, width, height])
         self._views = Views(
@@ -168,7 +175,7 @@ class ExactDensity:
         else:
             for done in [pool.submit(_values, *task) for task in tasks]:
                 done.result()
-        return out / max(self._views.count, 1)
+        return out / max(self._views.size, 1)
 
     def along(
         self, origins: Doubles, directions: Doubles, distances: Doubles
@@ -183,7 +190,7 @@ class ExactDensity:
         jets = _jets(
             self._views, self.window, np.ascontiguousarray(origins, np.float64),
             np.ascontiguousarray(directions, np.float64),
-            np.ascontiguousarray(distances, np.float64)) / max(self._views.count, 1)
+            np.ascontiguousarray(distances, np.float64)) / max(self._views.size, 1)
         return jets[:, 0], jets[:, 1], jets[:, 2]
 
 
@@ -229,7 +236,7 @@ def new_scratch(window: Window, views: Views) -> Scratch:
     """Make one thread's scratch arrays."""
     return Scratch(
         np.zeros((3, window.lanes), np.float32), np.zeros((3, window.lanes), np.float32),
-        np.zeros(3 * window.lanes, np.float32), np.zeros(max(views.count, 1), np.int64))
+        np.zeros(3 * window.lanes, np.float32), np.zeros(max(views.size, 1), np.int64))
 
 
 @njit(cache=True, nogil=True)
@@ -264,7 +271,7 @@ def _supported(
     cell = (
         views.layout[c, 2] + (int(v + whole) // _CELL) * views.layout[c, 3]
         + int(u + whole) // _CELL)
-    return views.near[cell] <= z <= views.far[cell]
+    return bool(views.near[cell] <= z <= views.far[cell])
 
 
 @njit(cache=True, nogil=True)
@@ -344,7 +351,7 @@ def _values(views: Views, window: Window, points: Doubles, out: Doubles) -> None
     still = np.zeros(3)
     for i in range(len(points)):
         total = 0.0
-        for c in range(views.count):
+        for c in range(views.size):
             x, _, y, _, z, _ = _camera_line(views, c, points[i], still, 0.0)
             seen, u, _, _, v, _, _ = project_jet(views.camera[c], x, 0.0, y, 0.0, z, 0.0)
             if not seen or not _supported(views, window, c, u, v, z):
@@ -365,10 +372,10 @@ def _jets(
 ) -> Doubles:
     scratch = new_scratch(window, views)
     out = np.zeros((len(origins), 3))
-    for c in range(views.count):
+    for c in range(views.size):
         scratch.nearby[c] = c
     for i in range(len(origins)):
         f, f1, f2, _ = jet_along(
-            views, window, scratch, views.count, origins[i], directions[i], distances[i], 1.0)
+            views, window, scratch, views.size, origins[i], directions[i], distances[i], 1.0)
         out[i, 0], out[i, 1], out[i, 2] = f, f1, f2
     return out

@@ -62,20 +62,21 @@ class Window(NamedTuple):
         return cls(float(bandwidth), float(reach), lanes, limit)
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _as_float(typing_context, bits):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
-    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+@intrinsic
+def _as_float(typing_context, bits):  # type: ignore[no-untyped-def]
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return builder.bitcast(arguments[0], ir.FloatType())
     return types.float32(types.int32), generate
 
 
 @njit(inline='always')
-def _exp2(x: float) -> float:
+def _exp2(x: np.float32) -> np.float32:
     """Return 2^x for -126 <= x <= 0; vectorises, as the library's does not."""
     n = np.floor(x + _HALF)
     r = x - n
     p = _C0 + r * (_C1 + r * (_C2 + r * (_C3 + r * (_C4 + r * (_C5 + r * _C6)))))
-    return p * _as_float((int32(n) + int32(127)) << int32(23))
+    power = (int32(n) + int32(127)) << int32(23)  # type: ignore[operator]
+    return p * _as_float(power)  # type: ignore[call-arg, no-any-return]
 
 
 @njit(cache=True, nogil=True, fastmath=_FAST, error_model='numpy')

@@ -3,13 +3,14 @@
 """
 Maxima of the density along the rays of a view.
 
-A ray starts at its pixel's observed depth, or where that is an outlier at a neighbour's, and climbs
-by Newton-Raphson on f (Grogan & Dahyot 2014). Newton is safe only where f'' < 0 and f does not
-fall; elsewhere the ray takes the mean-shift step, which always climbs. It stays within 4 h3 of its
-start.
+A ray starts at its pixel's observed depth, or where that is an outlier at a neighbour's, and
+climbs by Newton-Raphson on f (Grogan & Dahyot 2014). Newton is safe only where f'' < 0 and f does
+not fall; elsewhere the ray takes the mean-shift step, which always climbs. It stays within 4 h3 of
+its start.
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from enum import IntEnum
@@ -18,8 +19,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-from .exact_density import (
-    Doubles, ExactDensity, jet_along, new_scratch, sees, Views)
+from .exact_density import Doubles, ExactDensity, jet_along, new_scratch, sees, Views
 from .kernel import axis_weights, Floats, INVALID_DEPTH, Window, window_value
 from .view import View
 
@@ -68,7 +68,7 @@ class Rays:
     @property
     def converged(self) -> NDArray[np.bool_]:
         """Return which rays have found their maximum, (n,)."""
-        return self.status == Status.CONVERGED
+        return np.equal(self.status, Status.CONVERGED)
 
 
 def rays_of(
@@ -139,7 +139,7 @@ def affected(
     return out
 
 
-def _over_chunks(pool, count, task):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN202
+def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None]) -> None:
     """Run task(slice) over all chunks; each ray is its own, so any split gives the same bits."""
     parts = [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
     if pool is None:
@@ -168,7 +168,7 @@ def _march(
         h3 = _bandwidth(constant, quadratic, start)
         low, high = start - INTERVAL * h3, start + INTERVAL * h3
         nearby = 0
-        for c in range(views.count):
+        for c in range(views.size):
             if sees(views, window, c, origin, direction, low, high):
                 scratch.nearby[nearby] = c
                 nearby += 1
@@ -229,8 +229,8 @@ def _robust_starts(
     """
     Replace observed depths that their own image contradicts.
 
-    The candidates are the depths of the 5 x 5 neighbours; each is weighed by the view's own density
-    on the ray there, without the kernel of the pixel that proposes it.
+    The candidates are the depths of the 5 x 5 neighbours; each is weighed by the view's own
+    density on the ray there, without the kernel of the pixel that proposes it.
     """
     scratch = new_scratch(window, views)
     stride, before, width = (

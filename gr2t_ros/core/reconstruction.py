@@ -116,9 +116,13 @@ class Reconstruction:
             {'integrate': integrated - began, 'march': perf_counter() - integrated},
             wanted and full)
 
-    def finish(self) -> Update:
-        """March all rays that wait, as before a snapshot or at the end of a recording."""
-        return self._march_waiting(None, float('inf'))
+    def finish(self, budget: float = float('inf')) -> Update:
+        """
+        March all rays that wait, as before a snapshot or at the end of a recording.
+
+        :param budget: seconds after which what still waits is left
+        """
+        return self._march_waiting(None, perf_counter() + budget)
 
     def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
         """
@@ -144,7 +148,7 @@ class Reconstruction:
         likely = np.concatenate(totals) if totals else np.zeros(0)
         if not len(likely):
             return 0.0
-        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self._density.views.count
+        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self._density.views.size
 
     def close(self) -> None:
         """End the threads."""
@@ -165,7 +169,7 @@ class Reconstruction:
     def _march_waiting(self, new: int | None, deadline: float) -> Update:
         """March the new keyframe's rays, then what waits on older ones, newest first."""
         marched = remarched = converged = waiting = 0
-        changed = []
+        changed: list[int] = []
         for number in reversed(range(len(self.keyframes))):
             keyframe = self.keyframes[number]
             pending = np.flatnonzero(keyframe.waiting)

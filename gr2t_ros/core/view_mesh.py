@@ -55,7 +55,7 @@ def view_mesh(
     :param min_likelihood: least vertex, as a fraction of the 98th percentile
     :param min_edge_likelihood: least edge, as a fraction of the larger of its two vertices
     """
-    count = density.views.count
+    count = density.views.size
     likelihood = rays.total / np.float32(max(count, 1))
     kept = rays.converged
     if kept.any():
