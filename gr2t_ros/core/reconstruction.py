@@ -71,12 +71,14 @@ class Reconstruction:
     Meshes from depth images with known poses.
 
     :param settings: bandwidths, thresholds, keyframe distances, threads
+
+    `keyframes` are the views that own a mesh, `density` is what all views built.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
-        self._density = ExactDensity(
+        self.density = ExactDensity(
             settings.pixel_bandwidth, settings.depth_bandwidth,
             settings.depth_bandwidth_quadratic)
         self._pool = ThreadPoolExecutor(
@@ -96,16 +98,16 @@ class Reconstruction:
                 'image_size', f'depth image of shape {view.depth.shape} does not fit its camera '
                 f'of {view.camera.width} x {view.camera.height} pixels')
         began = perf_counter()
-        index = self._density.add(view)
+        index = self.density.add(view)
         for keyframe in self.keyframes:
-            keyframe.waiting |= affected(self._density, keyframe.rays, index, self._pool)
+            keyframe.waiting |= affected(self.density, keyframe.rays, index, self._pool)
         wanted = self._is_keyframe(view)
         full = len(self.keyframes) >= self.settings.max_keyframes
         number = None
         if wanted and not full:
             number = len(self.keyframes)
             rays = rays_of(
-                self._density, index, view, self.settings.ray_stride, self.settings.start,
+                self.density, index, view, self.settings.ray_stride, self.settings.start,
                 self._pool)
             self.keyframes.append(Keyframe(view, rays, np.ones(len(rays.pixels), np.bool_)))
         integrated = perf_counter()
@@ -132,7 +134,7 @@ class Reconstruction:
         """
         chosen = self.keyframes[keyframe]
         return view_mesh(
-            self._density, chosen.rays, chosen.view.camera.width,
+            self.density, chosen.rays, chosen.view.camera.width,
             self.settings.ray_stride * stride, self.settings.min_likelihood,
             self.settings.min_edge_likelihood, self._pool)
 
@@ -148,7 +150,7 @@ class Reconstruction:
         likely = np.concatenate(totals) if totals else np.zeros(0)
         if not len(likely):
             return 0.0
-        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self._density.views.size
+        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self.density.views.size
 
     def close(self) -> None:
         """End the threads."""
@@ -180,7 +182,7 @@ class Reconstruction:
                 which[pending[part:part + _SLICE]] = True
                 first = int(np.count_nonzero(keyframe.rays.iterations[which] == 0))
                 marched += first
-                remarched += march(self._density, keyframe.rays, which, self._pool) - first
+                remarched += march(self.density, keyframe.rays, which, self._pool) - first
                 converged += int(np.count_nonzero(keyframe.rays.converged[which]))
                 keyframe.waiting[which] = False
                 if changed[-1:] != [number]:
