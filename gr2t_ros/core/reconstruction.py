@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 import os
 from time import perf_counter
 
@@ -112,11 +112,9 @@ class Reconstruction:
             self.keyframes.append(Keyframe(view, rays, np.ones(len(rays.pixels), np.bool_)))
         integrated = perf_counter()
         update = self._march_waiting(number, integrated + self.settings.remarch_budget)
-        return Update(
-            number, update.marched, update.remarched, update.converged, update.waiting,
-            update.changed,
-            {'integrate': integrated - began, 'march': perf_counter() - integrated},
-            wanted and full)
+        return replace(
+            update, keyframe=number, refused_keyframe=wanted and full,
+            seconds={'integrate': integrated - began, 'march': perf_counter() - integrated})
 
     def finish(self, budget: float = float('inf')) -> Update:
         """
@@ -188,7 +186,9 @@ class Reconstruction:
                 if changed[-1:] != [number]:
                     changed.append(number)
             waiting += int(np.count_nonzero(keyframe.waiting))
-        return Update(None, marched, remarched, converged, waiting, tuple(changed))
+        return Update(
+            marched=marched, remarched=remarched, converged=converged, waiting=waiting,
+            changed=tuple(changed))
 
 
 def warm_up(settings: Settings) -> float:
