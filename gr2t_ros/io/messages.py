@@ -1,0 +1,344 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+ROS messages to numpy.
+
+Whatever has a message's fields will do: rclpy's messages, and those that rosbags reads from
+recordings, ROS 1's included. Nothing here trusts a message's numbers.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import hypot, isfinite
+import struct
+from typing import Any, NamedTuple
+
+import cv2
+from numba import njit
+import numpy as np
+from numpy.typing import NDArray
+
+from ..core.camera import Camera
+from ..core.poses import plain, Pose, seconds
+from ..errors import FrameError
+
+MAX_PIXELS = 1 << 25  # of an image; 134 MB as float32, four times the largest depth camera
+_TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
+_KNOWN = '16UC1 and mono16 (millimetres), 32FC1 (metres)'
+_NO_RETURN = 65535  # with 0: how drivers write "no depth" in whole millimetres
+# hand-written quaternions have two decimals, and many nodes compute in single precision
+_MAX_QUATERNION_ERROR = 0.01
+
+_CONFIG = struct.Struct('<iff')  # compressedDepth: format, depth quantisation A and B
+_PNG = b'\x89PNG\r\n\x1a\n'
+_PNG_CHUNK = struct.Struct('>I4s')  # length of the content, name; a checksum follows
+_PNG_HEADER = struct.Struct('>8xIIBB')  # the first chunk: width, height, bits, colour type
+_RVL_SIZE = struct.Struct('<II')  # columns, rows
+
+
+class StampedPose(NamedTuple):
+    """
+    A pose out of a message.
+
+    :param parent: frame, without leading slash; likewise child, '' where the message has none
+    :param stamp_ns: nanoseconds
+    :param T_parent_child: (4, 4) float64, metres
+    """
+
+    parent: str
+    child: str
+    stamp_ns: int
+    T_parent_child: Pose
+
+
+def stamp_ns(header: Any) -> int:
+    """
+    Return a header's stamp in nanoseconds.
+
+    :param header: std_msgs/Header
+    """
+    return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
+
+
+def depth(msg: Any) -> NDArray[np.float32]:
+    """
+    Read a depth image.
+
+    :param msg: sensor_msgs/Image, or sensor_msgs/CompressedImage of compressedDepth
+    :return: (h, w) float32, metres, NaN where invalid
+    :raises FrameError: see depth_image, compressed_depth
+    """
+    return compressed_depth(msg) if hasattr(msg, 'format') else depth_image(msg)
+
+
+def depth_image(msg: Any) -> NDArray[np.float32]:
+    """
+    Read a depth image.
+
+    :param msg: sensor_msgs/Image: 16UC1 or mono16 in millimetres, 32FC1 in metres
+    :return: (h, w) float32, metres, NaN where invalid
+    :raises FrameError: if its encoding is another, or its sizes do not fit each other
+    """
+    encoding = _encoding(msg.encoding)
+    height, width, step = int(msg.height), int(msg.width), int(msg.step)
+    _check_size(height, width)
+    dtype = np.dtype(('>' if msg.is_bigendian else '<') + _TYPES[encoding])
+    row = width * dtype.itemsize
+    if step < row:
+        raise FrameError(
+            'image_size', f'depth image {width}x{height} {encoding} has step {step}, but a row '
+            f'takes {row} bytes: its publisher writes wrong headers')
+    need = step * (height - 1) + row
+    if len(msg.data) < need:
+        raise FrameError(
+            'image_size', f'depth image {width}x{height} {encoding} with step {step} has '
+            f'{len(msg.data)} bytes of data where it needs {need}: it was cut off')
+    raw = np.ndarray((height, width), dtype, msg.data, strides=(step, dtype.itemsize))
+    return _metres(raw)
+
+
+def compressed_depth(msg: Any) -> NDArray[np.float32]:
+    """
+    Decompress a depth image of image_transport's compressedDepth.
+
+    :param msg: sensor_msgs/CompressedImage with format '16UC1; compressedDepth png' or alike:
+        16UC1 or 32FC1, png (where none is named) or rvl
+    :return: (h, w) float32, metres, NaN where invalid
+    :raises FrameError: if the format is another, or the data are damaged
+    """
+    encoding, _, compression = str(msg.format).partition(';')
+    encoding = _encoding(encoding.strip())
+    decode = _DECODERS.get(compression.strip())
+    if decode is None:
+        raise FrameError(
+            'encoding', f'compressed depth image has format {str(msg.format)[:60]!r}; known are '
+            '16UC1 and 32FC1 with "compressedDepth png" or "compressedDepth rvl"')
+    data = bytes(msg.data)
+    if len(data) < _CONFIG.size:
+        raise _damaged(f'{len(data)} bytes of data')
+    _, a, b = _CONFIG.unpack_from(data)
+    raw = decode(data[_CONFIG.size:])
+    if encoding != '32FC1':
+        return _metres(raw)
+    # quantised inverse depth, as compressed_depth_image_transport writes it
+    with np.errstate(divide='ignore', invalid='ignore'):
+        metres = np.float32(a) / (raw.astype(np.float32) - np.float32(b))
+    metres[raw == 0] = np.nan
+    return _metres(metres)
+
+
+def camera(msg: Any, *, rectified: bool) -> Camera:
+    """
+    Read a camera.
+
+    :param msg: sensor_msgs/CameraInfo
+    :param rectified: whether the images are rectified
+    :raises FrameError: see Camera
+    """
+    # ROS 1 has these names in capitals
+    K, D, P = (getattr(msg, name if hasattr(msg, name) else name.upper()) for name in 'kdp')
+    roi = msg.roi
+    return Camera.from_camera_info(
+        int(msg.width), int(msg.height), K, D, P, str(msg.distortion_model), rectified=rectified,
+        roi=(int(roi.x_offset), int(roi.y_offset), int(roi.width), int(roi.height)),
+        binning=(int(msg.binning_x), int(msg.binning_y)))
+
+
+def pose(msg: Any, kind: str) -> StampedPose:
+    """
+    Read a pose message.
+
+    :param msg: the message that `kind` names
+    :param kind: pose, pose_with_covariance, odometry or transform, as Settings.pose_source
+    :raises FrameError: if its numbers are not finite, or its quaternion is far from length 1
+    """
+    header = msg.header
+    if kind == 'transform':
+        position, rotation = msg.transform.translation, msg.transform.rotation
+    else:
+        inner = msg.pose if kind == 'pose' else msg.pose.pose
+        position, rotation = inner.position, inner.orientation
+    parent, child = plain(header.frame_id), plain(getattr(msg, 'child_frame_id', ''))
+    stamp = stamp_ns(header)
+    numbers = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
+    norm = hypot(*numbers[3:])
+    if not (abs(norm - 1) <= _MAX_QUATERNION_ERROR and all(map(isfinite, numbers))):
+        what = (f'has a quaternion of length {norm:.3g}, not 1' if all(map(isfinite, numbers))
+                else 'has numbers that are not finite')
+        raise FrameError(
+            'bad_pose', f'the pose of {child or "the camera"} in {parent!r} at {seconds(stamp)} '
+            f'{what}: images at that time are left out')
+    T = _matrix(*numbers[:3], *(q / norm for q in numbers[3:]))
+    return StampedPose(parent, child, stamp, T)
+
+
+def transforms(msg: Any) -> list[StampedPose]:
+    """
+    Read a tf message.
+
+    :param msg: tf2_msgs/TFMessage
+    :return: its transforms; T_parent_child is NaN where the numbers are no pose (see pose)
+    """
+    result = []
+    for item in msg.transforms:
+        try:
+            result.append(pose(item, 'transform'))
+        except FrameError:
+            result.append(unknown_pose(item))
+    return result
+
+
+def unknown_pose(msg: Any) -> StampedPose:
+    """
+    Return the frames and the stamp of a pose message, with a pose of NaN.
+
+    :param msg: any message that `pose` takes
+    """
+    return StampedPose(
+        plain(msg.header.frame_id), plain(getattr(msg, 'child_frame_id', '')),
+        stamp_ns(msg.header), np.full((4, 4), np.nan))
+
+
+def _matrix(
+    px: float, py: float, pz: float, x: float, y: float, z: float, w: float
+) -> Pose:
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), px],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), py],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), pz],
+        [0.0, 0.0, 0.0, 1.0]])
+
+
+def _encoding(encoding: str) -> str:
+    if encoding not in _TYPES:
+        raise FrameError(
+            'encoding', f'depth image has encoding {str(encoding)[:40]!r}; known are {_KNOWN}: '
+            'choose the topic of the depth images, or convert it')
+    return encoding
+
+
+def _check_size(height: int, width: int) -> None:
+    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
+        raise FrameError(
+            'image_size', f'depth image is {width}x{height} pixels; from 1 to {MAX_PIXELS} are '
+            'taken')
+
+
+def _metres(raw: NDArray[Any]) -> NDArray[np.float32]:
+    """Return float32 metres of whole millimetres or floating metres, NaN where invalid."""
+    if raw.dtype.kind == 'u':
+        metres: NDArray[np.float32] = np.divide(raw, np.float32(1000), dtype=np.float32)
+        metres[(raw == 0) | (raw == _NO_RETURN)] = np.nan
+    else:
+        metres = raw.astype(np.float32)
+        metres[~((metres > 0) & (metres < np.inf))] = np.nan
+    return metres
+
+
+def _damaged(what: str) -> FrameError:
+    return FrameError('damaged_image', f'compressed depth image is damaged: {what}')
+
+
+def _png(data: bytes) -> NDArray[np.uint16]:
+    if not data.startswith(_PNG):
+        raise _damaged('its data are no PNG')
+    chunks = _png_chunks(data)
+    if not chunks[0].startswith(b'IHDR', 4) or len(chunks[0]) < _PNG_HEADER.size:
+        raise _damaged('its PNG has no header')
+    width, height, bits, colour = _PNG_HEADER.unpack_from(chunks[0])
+    _check_size(height, width)
+    if (bits, colour) != (16, 0):
+        raise _damaged(f'its PNG has {bits} bits and colour type {colour}, not 16 bits of grey')
+    clean = np.frombuffer(_PNG + b''.join(chunks), np.uint8)
+    try:
+        image: Any = cv2.imdecode(clean, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None or image.dtype != np.uint16 or image.shape != (height, width):
+        raise _damaged('its PNG cannot be decoded')
+    return np.asarray(image)
+
+
+def _png_chunks(data: bytes) -> list[bytes]:
+    """
+    Return those chunks of a PNG that the image needs; the last is IEND.
+
+    OpenCV believes a damaged length and takes gigabytes; the other chunks only add to what can
+    go wrong in it.
+    """
+    chunks = []
+    at, name = len(_PNG), b''
+    while name != b'IEND':
+        end = at + _PNG_CHUNK.size
+        if end <= len(data):
+            length, name = _PNG_CHUNK.unpack_from(data, at)
+            end += length + 4
+        if end > len(data):
+            raise _damaged('its PNG is cut off')
+        if name in (b'IHDR', b'IDAT', b'IEND'):
+            chunks.append(data[at:end])
+        at = end
+    return chunks
+
+
+def _rvl(data: bytes) -> NDArray[np.uint16]:
+    if len(data) < _RVL_SIZE.size:
+        raise _damaged(f'{len(data)} bytes of RVL')
+    width, height = _RVL_SIZE.unpack_from(data)
+    _check_size(height, width)
+    words = np.array(np.frombuffer(data, '<u4', len(data) // 4 - 2, 8), np.uint32)
+    pixels = np.zeros(height * width, np.uint16)
+    if not _decode_rvl(words, pixels):
+        raise _damaged(f'its RVL does not make {width}x{height} pixels')
+    return pixels.reshape(height, width)
+
+
+@njit(cache=True, nogil=True)
+def _decode_rvl(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
+    """
+    Decode RVL (Wilson, Fast Lossless Depth Image Compression, 2017).
+
+    Runs of zeros and of others take turns; each other is the zigzag-coded difference to the one
+    before. Numbers are groups of three bits, the lowest first, in nibbles whose top bit says that
+    more follow; nibbles fill 32-bit words from the top.
+
+    :param words: (n,) uint32
+    :param pixels: (m,) uint16, zero, filled
+    :return: whether the words made exactly m pixels
+    """
+    nibbles = 8 * len(words)
+    at = 0  # nibble
+    filled = 0
+    left = 0  # others left in this run
+    previous = 0
+    zeros_next = True
+    while filled < len(pixels) or left != 0:
+        value = 0
+        shift = 0
+        more = True
+        while more:
+            if at == nibbles or shift > 30:
+                return False
+            nibble = (int(words[at >> 3]) >> (28 - 4 * (at & 7))) & 15
+            at += 1
+            value |= (nibble & 7) << shift
+            shift += 3
+            more = nibble & 8 != 0
+        if left > 0:
+            previous = (previous + ((value >> 1) ^ -(value & 1))) & 0xffff
+            pixels[filled] = previous
+            filled += 1
+            left -= 1
+        else:
+            if value > len(pixels) - filled:
+                return False
+            if zeros_next:
+                filled += value
+            else:
+                left = value
+            zeros_next = not zeros_next
+    return True
+
+
+_DECODERS: dict[str, Callable[[bytes], NDArray[np.uint16]]] = {
+    '': _png, 'compressedDepth': _png, 'compressedDepth png': _png, 'compressedDepth rvl': _rvl}
