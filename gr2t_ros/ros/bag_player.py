@@ -1,0 +1,175 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Plays a rosbag2 recording over DDS, where `ros2 bag play` is not installed.
+
+Messages go out as the recorded bytes. Topics whose message type is not installed are skipped.
+"""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterable, Sequence
+from importlib import import_module
+from pathlib import Path
+import signal
+import sys
+import time
+from typing import Any
+
+import rclpy
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import get_typestore, Stores
+from tqdm import tqdm
+
+from ..errors import Gr2tError, InputError
+
+_IMAGES = ('sensor_msgs/msg/Image', 'sensor_msgs/msg/CompressedImage')
+_DEPTH = 100  # messages kept for a reader that is slow
+_RELIABLE_AFTER = 2.0  # s that a best-effort subscriber has for becoming a reliable one
+_POLL = 0.02  # s
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Play what the command line says; return the exit code."""
+    parser = argparse.ArgumentParser(
+        prog='bag_player', description='Plays a rosbag2 recording over DDS.')
+    parser.add_argument('bag', type=Path, help='folder, or bare .mcap or .db3 file')
+    parser.add_argument(
+        '--rate', type=float, default=1.0, help='times the recorded speed (default: 1)')
+    parser.add_argument(
+        '--wait', type=float, default=10.0, metavar='S',
+        help='wait at most so many seconds for a subscriber of an image topic (default: 10)')
+    options = parser.parse_args(arguments)
+    if not options.rate > 0:
+        parser.error(f'--rate must be above 0, not {options.rate:g}')
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        play(options.bag, options.rate, options.wait)
+    except KeyboardInterrupt:
+        return 130
+    except Gr2tError as error:
+        sys.stderr.write(f'bag_player: {error}\n')
+        return 2 if isinstance(error, InputError) else 1
+    return 0
+
+
+def play(bag: Path, rate: float = 1.0, wait: float = 10.0) -> int:
+    """
+    Play a recording to its end.
+
+    :param rate: times the recorded speed
+    :param wait: seconds for a subscriber of an image topic to appear
+    :return: the number of messages played
+    :raises InputError: if it is no rosbag2 recording or none of its message types is installed
+    """
+    if not bag.exists():
+        raise InputError(f'{bag}: no such file or folder')
+    try:
+        # sqlite3 recordings from before Iron come without definitions
+        reader = AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except Exception as error:  # damaged files make the library raise anything
+        raise InputError(f'cannot read {bag}: {error}') from error
+    try:
+        if not reader.is2:
+            raise InputError(
+                f'{bag} is a ROS 1 recording: `gr2t replay` reads it, the player does not')
+        # SIGINT must stay Python's: rclpy's handler would end the context under the publishers
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        try:
+            return _play(reader, Node('bag_player'), rate, wait)
+        finally:
+            rclpy.try_shutdown()
+    finally:
+        reader.close()
+
+
+def _play(reader: AnyReader, node: Node, rate: float, wait: float) -> int:
+    publishers = _publishers(node, reader.connections)
+    if not publishers:
+        raise InputError('none of the message types in the recording is installed: source ROS 2')
+    _wait_for_subscriber(node, publishers.values(), wait)
+    connections = [item for item in reader.connections if item.topic in publishers]
+    duration = (reader.end_time - reader.start_time) / 1e9 / rate
+    played = 0
+    started = time.monotonic()
+    with tqdm(
+            total=sum(item.msgcount for item in connections), unit=' messages',
+            desc=f'{duration:.1f} s', dynamic_ncols=True, disable=None) as progress:
+        for connection, log_time, data in reader.messages(connections):
+            due = started + (log_time - reader.start_time) / 1e9 / rate
+            time.sleep(max(0.0, due - time.monotonic()))
+            publishers[connection.topic].publish(bytes(data))
+            played += 1
+            progress.update()
+    for publisher in publishers.values():
+        publisher.wait_for_all_acked(Duration(seconds=10))
+    tqdm.write(f'played {played} messages in {time.monotonic() - started:.1f} s', sys.stderr)
+    return played
+
+
+def _publishers(node: Node, connections: Iterable[Connection]) -> dict[str, Publisher]:
+    """Return a publisher for each topic whose type is installed; say which are not."""
+    publishers: dict[str, Publisher] = {}
+    for connection in connections:
+        if connection.topic in publishers:
+            continue
+        kind = _message_type(connection.msgtype)
+        if kind is None:
+            tqdm.write(
+                f'skipped {connection.topic}: {connection.msgtype} is not installed', sys.stderr)
+            continue
+        durability = (
+            DurabilityPolicy.TRANSIENT_LOCAL if connection.topic == '/tf_static'
+            else DurabilityPolicy.VOLATILE)
+        publishers[connection.topic] = node.create_publisher(
+            kind, connection.topic, QoSProfile(
+                depth=_DEPTH, reliability=ReliabilityPolicy.RELIABLE, durability=durability))
+    return publishers
+
+
+def _message_type(name: str) -> Any:
+    """Return the class of `package/msg/Name`, or None where it is not installed."""
+    package, _, kind = name.partition('/msg/')
+    try:
+        return getattr(import_module(f'{package}.msg'), kind, None)
+    except ImportError:
+        return None
+
+
+def _wait_for_subscriber(node: Node, publishers: Iterable[Publisher], seconds: float) -> None:
+    """
+    Wait until someone subscribes to images, reliably if possible; in vain at most so long.
+
+    A node may subscribe at best effort first and change once it sees that the publisher is
+    reliable; a recording that starts before that loses its first images.
+    """
+    publishers = list(publishers)
+    images = [item for item in publishers if item.msg_type in map(_message_type, _IMAGES)]
+    deadline = time.monotonic() + seconds
+    matched = None
+    while time.monotonic() < deadline:
+        heard = [item for item in images or publishers if item.get_subscription_count()]
+        if heard:
+            matched = matched or time.monotonic()
+            reliable = any(
+                info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
+                for item in heard
+                for info in node.get_subscriptions_info_by_topic(item.topic_name))
+            if reliable or time.monotonic() - matched > _RELIABLE_AFTER:
+                return
+        time.sleep(_POLL)
+    tqdm.write(
+        f'nobody subscribes to {", ".join(item.topic_name for item in images or publishers)} '
+        f'after {seconds:g} s; playing nevertheless', sys.stderr)
+
+
+if __name__ == '__main__':
+    sys.exit(main())

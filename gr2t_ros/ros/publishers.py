@@ -1,0 +1,179 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the node publishes of the map: markers and a point cloud."""
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable, Sequence
+import time
+
+import numpy as np
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.time import Time
+from sensor_msgs.msg import PointCloud2, PointField
+from visualization_msgs.msg import MarkerArray
+
+from ..core.colour import colours
+from ..core.reconstruction import Reconstruction
+from ..core.view_mesh import ViewMesh
+from ..io.cdr import no_markers, triangle_markers, Triangles
+from ..settings import Settings
+
+NAMESPACE = 'mesh'
+MAX_POINTS = 2_000_000
+_MAX_CORNERS = 400_000  # in one message: 16 MB; what is over goes with the next
+_MAX_SECONDS = 0.25  # for making one message
+_NEW_COLOURS = 0.2  # change of the colour scale with which all meshes are sent again
+_POINT = np.dtype([
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('rgb', '<u4'), ('likelihood', '<f4')])
+
+
+class MapPublishers:
+    """
+    ~/mesh: one TRIANGLE_LIST for each keyframe. ~/points: the vertices of all of them.
+
+    Meshes that changed are sent again, those that wait longest first, as many as fit one message;
+    all of them where someone new listens. Nothing is computed while nobody does.
+
+    :param node: on which to advertise
+    :param settings: display_stride and colour_map count
+    """
+
+    def __init__(self, node: Node, settings: Settings) -> None:
+        self._settings = settings
+        self._mesh = node.create_publisher(MarkerArray, '~/mesh', outputs_profile(5))
+        self._points = node.create_publisher(PointCloud2, '~/points', outputs_profile(1))
+        self._listeners = {self._mesh: 0, self._points: 0}
+        self._waiting: dict[int, None] = {}  # keyframes, in order
+        self._clouds: dict[int, NDArray[np.void]] = {}  # of each keyframe; see cloud
+        self._scale = 0.0
+
+    def change(self, keyframes: Iterable[int]) -> None:
+        """Note keyframes whose meshes changed."""
+        self._waiting.update(dict.fromkeys(keyframes))
+
+    def publish(
+        self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
+    ) -> None:
+        """
+        Send what changed to whoever listens.
+
+        :param frame_id: the world frame
+        :param stamp_ns: of the newest image in the map
+        :param views: in the map
+        """
+        everything = range(len(reconstruction.keyframes))
+        appeared = [self._appeared(publisher) for publisher in (self._mesh, self._points)]
+        if any(appeared):
+            self.change(everything)
+        if not any(self._listeners.values()):
+            self._clouds.clear()
+            return
+        if not self._waiting:
+            return
+        scale = reconstruction.colour_scale()
+        # likelihoods are shares of the number of views; what they are shares of is compared
+        if abs(views * scale - self._scale) > _NEW_COLOURS * self._scale:
+            self._scale = views * scale
+            self.change(everything)
+        meshes = self._take(reconstruction)
+        if self._listeners[self._mesh]:
+            self._mesh.publish(triangle_markers(frame_id, NAMESPACE, [
+                triangles(keyframe, mesh, scale, self._settings.colour_map)
+                for keyframe, mesh in meshes.items()]))
+        if self._listeners[self._points]:
+            self._clouds.update(
+                (keyframe, cloud(mesh, views)) for keyframe, mesh in meshes.items())
+            message = point_cloud(
+                [*self._clouds.values()], views, scale, self._settings.colour_map)
+            self._send_points(message, frame_id, stamp_ns)
+
+    def clear(self, frame_id: str) -> None:
+        """Take back all that was sent, also from those who come late."""
+        self._waiting.clear()
+        self._clouds.clear()
+        self._scale = 0.0
+        self._mesh.publish(no_markers(frame_id, NAMESPACE))
+        self._send_points(point_cloud([], 0, 0.0, self._settings.colour_map), frame_id, 0)
+
+    def _appeared(self, publisher: Publisher) -> bool:
+        before = self._listeners[publisher]
+        self._listeners[publisher] = publisher.get_subscription_count()
+        return self._listeners[publisher] > before
+
+    def _take(self, reconstruction: Reconstruction) -> dict[int, ViewMesh]:
+        """Return the meshes that are to be sent now."""
+        meshes: dict[int, ViewMesh] = {}
+        corners = 0
+        end = time.monotonic() + _MAX_SECONDS
+        while self._waiting and corners < _MAX_CORNERS and time.monotonic() < end:
+            keyframe = next(iter(self._waiting))
+            del self._waiting[keyframe]
+            meshes[keyframe] = reconstruction.mesh(keyframe, self._settings.display_stride)
+            corners += meshes[keyframe].faces.size
+        return meshes
+
+    def _send_points(self, message: PointCloud2, frame_id: str, stamp_ns: int) -> None:
+        message.header.stamp = Time(nanoseconds=stamp_ns).to_msg()
+        message.header.frame_id = frame_id
+        self._points.publish(message)
+
+
+def outputs_profile(depth: int) -> QoSProfile:
+    """Return the QoS of all outputs: whoever comes late gets the last messages."""
+    return QoSProfile(
+        depth=depth, reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def triangles(marker: int, mesh: ViewMesh, scale: float, colour_map: str) -> Triangles:
+    """Return a mesh as a marker has it: each triangle's three corners written out."""
+    corners = mesh.faces.reshape(-1)
+    colour = colours(mesh.vertex_likelihood, scale, colour_map)
+    return Triangles(marker, mesh.vertices[corners], colour[corners])
+
+
+def cloud(mesh: ViewMesh, views: int) -> NDArray[np.void]:
+    """
+    Return a mesh's vertices as points without colours.
+
+    :param views: in the map: by so many the likelihoods are multiplied, so that they stay
+        comparable with those of other meshes while views come
+    """
+    points = np.zeros(len(mesh.vertices), _POINT)
+    for axis, name in enumerate('xyz'):
+        points[name] = mesh.vertices[:, axis]
+    points['likelihood'] = mesh.vertex_likelihood * views
+    return points
+
+
+def point_cloud(
+    clouds: Sequence[NDArray[np.void]], views: int, scale: float, colour_map: str
+) -> PointCloud2:
+    """
+    Return points as a message without header: x, y, z, rgb, likelihood.
+
+    :param clouds: of `cloud`
+    :param views: in the map
+    :param scale: the likelihood that gets the last colour
+    """
+    points = np.concatenate([np.zeros(0, _POINT), *clouds])
+    points = np.ascontiguousarray(points[::len(points) // MAX_POINTS + 1])
+    points['likelihood'] /= max(views, 1)
+    rgb = colours(points['likelihood'], scale, colour_map).astype(np.uint32)
+    points['rgb'] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    message = PointCloud2()
+    message.height = 1
+    message.width = len(points)
+    # viewers expect the three bytes of rgb under the name of a float32
+    message.fields = [
+        PointField(name=name, offset=4 * i, datatype=PointField.FLOAT32, count=1)
+        for i, name in enumerate(_POINT.names or ())]
+    message.point_step = _POINT.itemsize
+    message.row_step = points.nbytes
+    message.is_dense = True
+    message.data = array('B', points.tobytes())
+    return message

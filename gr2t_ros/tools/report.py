@@ -1,0 +1,140 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What a run did: counts, timings and results, as report.json and as a table."""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+import json
+from pathlib import Path
+import resource
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..io.files import whole_file
+from ..settings import Settings
+
+STAGES = ('read', 'integrate', 'march', 'mesh', 'total')
+
+
+@dataclass
+class Run:
+    """
+    What is counted and timed while a recording is replayed.
+
+    :param seconds: of each of STAGES, once per frame in which the stage ran
+    :param loop_seconds: wall time from the first read to the last frame done
+    :param first_stamp_ns: of the images that were integrated; likewise last_stamp_ns
+    """
+
+    settings: Settings
+    read: int = 0
+    integrated: int = 0
+    keyframes: int = 0
+    refused_keyframes: int = 0
+    dropped: Counter[str] = field(default_factory=Counter)
+    explanations: dict[str, str] = field(default_factory=dict)
+    marched: int = 0
+    remarched: int = 0
+    converged: int = 0
+    seconds: dict[str, list[float]] = field(
+        default_factory=lambda: {stage: [] for stage in STAGES})
+    loop_seconds: float = 0.0
+    startup_seconds: float = 0.0
+    finish_seconds: float = 0.0
+    first_stamp_ns: int = 0
+    last_stamp_ns: int = 0
+    input_damage: str = ''
+
+
+def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[str, Any]:
+    """
+    Return the content of report.json.
+
+    :param counts: vertices, edges and faces of the mesh that was written
+    :param likelihood: (n,) of its vertices
+    """
+    recorded = (run.last_stamp_ns - run.first_stamp_ns) * 1e-9
+    likelihood = np.asarray(likelihood, np.float64)
+    some = likelihood.size > 0
+    return {
+        'frames': {
+            'read': run.read, 'integrated': run.integrated, 'keyframes': run.keyframes,
+            'dropped': dict(sorted(run.dropped.items()))},
+        'rays': {
+            'marched': run.marched, 'remarched': run.remarched, 'converged': run.converged},
+        'timing_ms': {stage: _milliseconds(run.seconds[stage]) for stage in STAGES},
+        'frames_per_second': run.integrated / run.loop_seconds if run.loop_seconds else 0.0,
+        'realtime_factor': recorded / run.loop_seconds if run.loop_seconds else 0.0,
+        'peak_memory_mb': peak_memory_mb(),
+        'mesh': dict(counts),
+        'likelihood': {
+            'max': float(likelihood.max()) if some else 0.0,
+            'p50': float(np.percentile(likelihood, 50)) if some else 0.0,
+            'p98': float(np.percentile(likelihood, 98)) if some else 0.0},
+        'startup_s': run.startup_seconds,
+        'finish_s': run.finish_seconds,
+        'input_damage': run.input_damage,
+        'settings': asdict(run.settings),
+    }
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """
+    Write a report.
+
+    :raises Gr2tError: if the file cannot be written
+    """
+    with whole_file(path) as stream:
+        stream.write(json.dumps(content, indent=2).encode() + b'\n')
+
+
+def table(content: Mapping[str, Any], run: Run, results: Mapping[str, str]) -> str:
+    """
+    Return a report as a few lines to read.
+
+    :param results: path of each file written -> what it is
+    """
+    frames, rays, timing = content['frames'], content['rays'], content['timing_ms']
+    width = max(map(len, results), default=0)
+    lines = [f'{path:{width}}  {text}'.rstrip() for path, text in results.items()]
+    lines += [
+        f'frames   {frames["read"]} read, {frames["integrated"]} integrated, '
+        f'{frames["keyframes"]} keyframes, {sum(frames["dropped"].values())} dropped']
+    lines += [f'dropped  {count} {reason}: {run.explanations.get(reason, "")}'
+              for reason, count in frames['dropped'].items()]
+    lines += [f'note     {sentence}' for reason, sentence in run.explanations.items()
+              if reason not in frames['dropped']]
+    lines += [
+        f'rays     {rays["marched"]} marched, {rays["remarched"]} again, '
+        f'{rays["converged"]} converged',
+        f'time     {run.loop_seconds:.1f} s: {content["frames_per_second"]:.2f} frames/s, '
+        f'{content["realtime_factor"]:.2f} x real time; start {run.startup_seconds:.1f} s, '
+        f'finish {run.finish_seconds:.1f} s',
+        'mean     ' + ', '.join(f'{stage} {timing[stage]["mean"]:.1f} ms' for stage in STAGES),
+        f'memory   {content["peak_memory_mb"]:.0f} MB at most']
+    if run.refused_keyframes:
+        lines.append(
+            f'keyframes reached max_keyframes ({run.settings.max_keyframes}): '
+            f'{run.refused_keyframes} later ones own no mesh')
+    if run.input_damage:
+        lines.append(f'damage   {run.input_damage}')
+    return '\n'.join(lines)
+
+
+def peak_memory_mb() -> float:
+    """Return the largest resident size of this process so far, 10^6 bytes."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == 'darwin' else peak * 1024 / 1e6
+
+
+def _milliseconds(seconds: Sequence[float]) -> dict[str, float]:
+    if not seconds:
+        return {'mean': 0.0, 'p50': 0.0, 'p95': 0.0}
+    p50, p95 = np.percentile(seconds, (50, 95))
+    return {'mean': 1e3 * float(np.mean(seconds)), 'p50': 1e3 * float(p50),
+            'p95': 1e3 * float(p95)}

@@ -1,0 +1,103 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What a replay leaves: mesh.ply, preview.png, report.json and a mesh for each view."""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+
+from ..core.reconstruction import Reconstruction
+from ..core.view_mesh import ViewMesh
+from ..io import ply
+from . import report
+from .progress import Progress, say
+from .render import preview
+
+
+def write_results(
+    reconstruction: Reconstruction, run: report.Run, directory: Path, title: str, *,
+    per_view: bool,
+) -> str:
+    """
+    Write all results of a run.
+
+    :param run: what was counted so far; the times of writing are added
+    :param title: below the picture
+    :param per_view: whether each keyframe's mesh becomes a file too
+    :return: a table of what was written, and of the run
+    :raises Gr2tError: if a file cannot be written
+    """
+    begin = perf_counter()
+    say(f'writing {directory} ...')
+    meshes = _Meshes(reconstruction, run, directory / 'views' if per_view else None)
+    written = ply.write_views(
+        directory / 'mesh.ply', meshes.all, meshes.scale, run.settings.colour_map,
+        expected_vertices=meshes.expected)
+    counts = {'vertices': written.vertices, 'edges': written.edges, 'faces': written.faces}
+    results = {str(written.path): ', '.join(f'{n} {name}' for name, n in counts.items())}
+    if written.stride > 1:
+        results[str(written.path)] += (
+            f'; decimated by {written.stride} in rows and columns, to at most {ply.MAX_FACES} '
+            'faces')
+    if per_view:
+        meshes.write_other_views()
+        results[str(directory / 'views')] = f'{len(reconstruction.keyframes)} keyframes'
+    mesh = ply.read(written.path).mesh
+    picture = directory / 'preview.png'
+    preview(
+        picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, meshes.scale,
+        run.settings.colour_map, title=title,
+        poses=[item.view.T_world_camera for item in reconstruction.keyframes])
+    results[str(picture)] = ''
+    run.finish_seconds += perf_counter() - begin
+    content = report.report(run, counts, mesh.vertex_likelihood)
+    report.write(directory / 'report.json', content)
+    results[str(directory / 'report.json')] = ''
+    return report.table(content, run, results)
+
+
+class _Meshes:
+    """The keyframes' meshes, timed; each goes to a file of its own when it is first made."""
+
+    def __init__(
+        self, reconstruction: Reconstruction, run: report.Run, views: Path | None
+    ) -> None:
+        self.scale = reconstruction.colour_scale()
+        self.expected = sum(
+            int(np.count_nonzero(item.rays.converged)) for item in reconstruction.keyframes)
+        self._reconstruction = reconstruction
+        self._run = run
+        self._views = views
+        self._written: set[int] = set()
+
+    def all(self, stride: int) -> Iterator[tuple[int, ViewMesh]]:
+        """Yield them in order, as ply.write_views wants it."""
+        seconds = self._run.seconds['mesh'] = []
+        count = len(self._reconstruction.keyframes)
+        with Progress(count, 'meshes') as bar:
+            for number in range(count):
+                begin = perf_counter()
+                mesh = self._reconstruction.mesh(number, stride)
+                seconds.append(perf_counter() - begin)
+                if stride == 1:
+                    self._write_view(number, mesh)
+                bar.reach(number + 1)
+                yield number, mesh
+
+    def write_other_views(self) -> None:
+        """Write the files of those that were made decimated only."""
+        for number in range(len(self._reconstruction.keyframes)):
+            if number not in self._written:
+                self._write_view(number, self._reconstruction.mesh(number))
+
+    def _write_view(self, number: int, mesh: ViewMesh) -> None:
+        def strided(stride: int) -> list[tuple[int, ViewMesh]]:
+            return [(number, mesh if stride == 1 else self._reconstruction.mesh(number, stride))]
+        if self._views is not None:
+            ply.write_views(
+                self._views / f'view_{number:04d}.ply', strided, self.scale,
+                self._run.settings.colour_map)
+            self._written.add(number)

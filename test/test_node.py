@@ -1,0 +1,286 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""gr2t_node in its own process, fed over DDS from another one."""
+from array import array
+from collections.abc import Iterator
+from pathlib import Path
+import re
+import signal
+import time
+
+import numpy as np
+import pytest
+
+from gr2t_ros.io.ply import read
+from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
+
+rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not installed')
+pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
+
+from geometry_msgs.msg import PoseStamped  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from rclpy.serialization import deserialize_message  # noqa: E402
+from rclpy.time import Time  # noqa: E402
+from ros_for_tests import Isolation, NodeProcess, Observer, plane_views, wait_until  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
+from std_srvs.srv import SetBool, Trigger  # noqa: E402
+from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
+
+from gr2t_ros.ros.publishers import outputs_profile  # noqa: E402
+
+FRAMES = 6
+FLAT = 0.01  # m from the plane; beside a border kernels are one-sided
+
+
+@pytest.fixture
+def isolation() -> Isolation:
+    """Return a ROS domain that no other test uses."""
+    return Isolation()
+
+
+@pytest.fixture
+def observer(isolation: Isolation) -> Iterator[Observer]:
+    """Return a node of this process in the test's domain."""
+    observer = Observer(isolation)
+    yield observer
+    observer.close()
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of a plane."""
+    path = tmp_path_factory.mktemp('bags') / 'plane'
+    assert record(path, plane_views(FRAMES)) == FRAMES
+    return path
+
+
+def test_map_from_a_played_bag(
+    isolation: Isolation, observer: Observer, bag: Path, tmp_path: Path
+) -> None:
+    """Mesh, points and snapshot show the plane; reset empties them, pause stops them."""
+    with NodeProcess(isolation, tmp_path, '-p', 'publish_rate:=10.0') as node:
+        arrays = observer.collect(MarkerArray, '/gr2t/mesh', outputs_profile(10))
+        clouds = observer.collect(PointCloud2, '/gr2t/points', outputs_profile(10))
+        assert not observer.call(Trigger, 'save_snapshot').success
+
+        isolation.play(bag)
+        last_stamp = plane_views(FRAMES)[-1].stamp_ns
+        observer.spin_until(
+            lambda: clouds and Time.from_msg(
+                deserialize_message(clouds[-1], PointCloud2).header.stamp
+            ).nanoseconds == last_stamp, 'a cloud with the last image')
+
+        _check_cloud(deserialize_message(clouds[-1], PointCloud2))
+        markers = _markers(arrays)
+        for marker in markers.values():
+            _check_marker(marker)
+        answer = observer.call(Trigger, 'save_snapshot')
+        assert answer.success, answer.message
+        path = Path(answer.message.partition(': ')[0])
+        mesh = read(path).mesh
+        assert path.parent == node.snapshots
+        assert np.abs(mesh.vertices[:, 2]).max() < FLAT
+        assert f'{len(mesh.faces)} faces' in answer.message
+        assert set(read(path).vertex_view) == set(markers)
+
+        # someone who comes late gets everything
+        late = observer.collect(MarkerArray, '/gr2t/mesh', outputs_profile(10))
+        observer.spin_until(lambda: _markers(late).keys() == markers.keys(), 'all markers again')
+
+        arrays.clear()
+        assert observer.call(Trigger, 'reset').success
+        observer.spin_until(lambda: arrays, 'a message that deletes the markers')
+        assert deserialize_message(arrays[-1], MarkerArray).markers[0].action == Marker.DELETEALL
+        assert not observer.call(Trigger, 'save_snapshot').success
+
+        assert observer.call(SetBool, 'pause', data=True).success
+        isolation.play(bag)
+        assert not observer.call(Trigger, 'save_snapshot').success
+        assert observer.call(SetBool, 'pause', data=False).success
+        isolation.play(bag)
+        observer.spin_until(
+            lambda: observer.call(Trigger, 'save_snapshot').success, 'a snapshot after the pause')
+
+        assert node.stop() == 0
+        assert re.search(
+            rf'frames: {3 * FRAMES} received, {2 * FRAMES} integrated, {FRAMES} dropped '
+            rf'\(paused {FRAMES}\), 0 waiting', node.log)
+        assert len(list(node.snapshots.iterdir())) >= 2
+
+
+def _markers(arrays: list[bytes]) -> dict[int, Marker]:
+    """Return the markers as a viewer has them after these messages."""
+    markers: dict[int, Marker] = {}
+    for data in arrays:
+        for marker in deserialize_message(data, MarkerArray).markers:
+            markers[marker.id] = marker
+    return markers
+
+
+def _check_marker(marker: Marker) -> None:
+    assert (marker.action, marker.type) == (Marker.ADD, Marker.TRIANGLE_LIST)
+    assert marker.header.frame_id == 'map'
+    assert len(marker.points) == len(marker.colors) > 100
+    assert len(marker.points) % 3 == 0
+    assert max(abs(point.z) for point in marker.points) < FLAT
+    assert marker.color.a == 1.0
+    assert all(colour.a == 1.0 for colour in marker.colors)
+    assert marker.scale.x == marker.scale.y == marker.scale.z == 1.0
+
+
+def _check_cloud(cloud: PointCloud2) -> None:
+    assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'rgb', 'likelihood']
+    assert cloud.header.frame_id == 'map'
+    points = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)
+    assert len(points) == cloud.width * cloud.height > 100
+    assert np.abs(points[:, 2]).max() < FLAT
+    assert (points[:, 4] > 0).all()
+
+
+@pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])
+def test_signals_end_it_with_a_snapshot(
+    isolation: Isolation, bag: Path, tmp_path: Path, number: signal.Signals
+) -> None:
+    with NodeProcess(isolation, tmp_path, '-p', 'snapshot_on_exit:=true') as node:
+        isolation.play(bag)
+        assert node.stop(number) == 0
+        snapshots = list(node.snapshots.iterdir())
+        assert len(snapshots) == 1
+        assert len(read(snapshots[0]).mesh.faces) > 100
+        assert f'snapshot: {snapshots[0]}' in node.log
+
+
+def test_a_signal_before_any_input(isolation: Isolation, tmp_path: Path) -> None:
+    with NodeProcess(isolation, tmp_path) as node:
+        assert node.stop(signal.SIGTERM) == 0
+        assert 'frames: 0 received' in node.log
+        assert not node.snapshots.exists()
+
+
+@pytest.mark.parametrize(('arguments', 'words'), [
+    (('-p', 'depth_max:=-1.0'), 'depth_max must lie in [0, 1000] m'),
+    (('-p', 'depth_mx:=3.0'), 'unknown parameter depth_mx; did you mean depth_max?'),
+    (('-p', 'ray_stride:=two'), 'ray_stride must be a whole number'),
+    (('-p', 'pose_source:=gps'), 'pose_source must be one of tf, pose'),
+    (('--params-file', '/nowhere.yaml'), '/nowhere.yaml'),
+])
+def test_a_parameter_that_cannot_be_used(
+    isolation: Isolation, tmp_path: Path, arguments: tuple[str, ...], words: str
+) -> None:
+    """One line says which, and the exit code is 2."""
+    with NodeProcess(isolation, tmp_path, *arguments, ready=False) as node:
+        assert node.wait() == 2
+        assert words in node.log
+        assert node.log.count('\n') == 1
+
+
+def test_all_parameters_are_described(
+    isolation: Isolation, observer: Observer, tmp_path: Path
+) -> None:
+    """`ros2 param describe` shows help, unit and range; what cannot change says so."""
+    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
+    from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+    with NodeProcess(isolation, tmp_path, '-p', 'depth_max:=4') as node:
+        names = observer.call(ListParameters, 'list_parameters').result.names
+        assert {'depth_max', 'world_frame', 'publish_rate', 'snapshot_on_exit'} <= set(names)
+        described = observer.call(
+            DescribeParameters, 'describe_parameters', names=['depth_max', 'pose_source'])
+        depth_max, pose_source = described.descriptors
+        assert depth_max.description == 'Depths above are invalid. [m]'
+        assert depth_max.floating_point_range[0].to_value == 1000.0
+        assert 'odometry' in pose_source.additional_constraints
+        new = Parameter(name='depth_max', value=ParameterValue(
+            type=ParameterType.PARAMETER_DOUBLE, double_value=3.0))
+        result = observer.call(SetParameters, 'set_parameters', parameters=[new]).results[0]
+        assert not result.successful
+        assert 'read-only' in result.reason
+        assert '* depth_max 4.0 m' in node.log
+
+
+def test_poses_from_a_topic(isolation: Isolation, observer: Observer, tmp_path: Path) -> None:
+    """Best-effort publishers and PoseStamped, no tf at all."""
+    publish = {
+        kind: observer.node.create_publisher(kind, topic, qos_profile_sensor_data)
+        for kind, topic in (
+            (Image, DEPTH_TOPIC), (CameraInfo, CAMERA_INFO_TOPIC), (PoseStamped, '/where'))}
+    with NodeProcess(
+            isolation, tmp_path, '-p', 'pose_source:=pose', '-r', 'pose:=/where',
+            '-p', 'max_wait_for_pose:=10.0') as node:
+        observer.spin_until(
+            lambda: all(item.get_subscription_count() for item in publish.values()),
+            'the node\'s subscriptions')
+        for view in plane_views(FRAMES):
+            pose, info, image = PoseStamped(), CameraInfo(), Image()
+            for message, frame in ((pose, 'lab'), (info, 'camera'), (image, 'camera')):
+                message.header.frame_id = frame
+                message.header.stamp = Time(nanoseconds=view.stamp_ns).to_msg()
+            pose.pose.position.x, pose.pose.position.y, pose.pose.position.z = map(
+                float, view.T_world_camera[:3, 3])
+            turn = pose.pose.orientation
+            turn.x, turn.y, turn.z, turn.w = map(
+                float, Rotation.from_matrix(view.T_world_camera[:3, :3]).as_quat())
+            camera = view.camera
+            info.height, info.width = camera.height, camera.width
+            info.k = [camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0]
+            image.height, image.width = view.depth.shape
+            image.encoding, image.step = '16UC1', 2 * image.width
+            image.data = array('B', np.round(1000 * view.depth).astype('<u2').tobytes())
+            for message in (pose, info, image):
+                publish[type(message)].publish(message)
+        observer.spin_until(
+            lambda: observer.call(Trigger, 'save_snapshot').success, 'a snapshot')
+        path = max(node.snapshots.iterdir())
+        assert np.abs(read(path).mesh.vertices[:, 2]).max() < FLAT
+        assert node.stop() == 0
+
+
+def test_silence_is_reported_once(isolation: Isolation, tmp_path: Path) -> None:
+    """The warning names the resolved topics."""
+    with NodeProcess(isolation, tmp_path) as node:
+        log = node.wait_for('nothing came for 5 s')
+        warning = next(line for line in log.splitlines() if 'nothing came for' in line)
+        for topic in (DEPTH_TOPIC, CAMERA_INFO_TOPIC, '/tf'):
+            assert f'{topic} (0 publishers, 0 messages)' in warning
+        assert node.stop() == 0
+        assert node.log.count('nothing came for') == 1
+
+
+def test_images_without_poses_are_counted_and_explained(
+    isolation: Isolation, tmp_path: Path
+) -> None:
+    bag = tmp_path / 'plane'
+    record(bag, plane_views(3))
+    with NodeProcess(
+            isolation, tmp_path, '-p', 'world_frame:=odom',
+            '-p', 'max_wait_for_pose:=0.2') as node:
+        isolation.play(bag)
+        node.wait_for('[unconnected_frames: said once')
+        wait_until(lambda: 'odom' in node.log, 'the frame\'s name')
+        assert node.stop() == 0
+        assert '3 dropped (unconnected_frames 3)' in node.log
+
+
+def test_services_answer_while_frames_come(
+    isolation: Isolation, observer: Observer, tmp_path: Path
+) -> None:
+    bag = tmp_path / 'plane'
+    record(bag, plane_views(60))
+    with NodeProcess(isolation, tmp_path) as node:
+        player = isolation.run('gr2t_ros.ros.bag_player', bag)
+        try:
+            observer.spin_until(
+                lambda: observer.call(Trigger, 'save_snapshot').success, 'a first snapshot')
+            for _ in range(3):
+                began = time.monotonic()
+                assert observer.call(Trigger, 'save_snapshot').success
+                assert observer.call(Trigger, 'reset').success
+                assert observer.call(SetBool, 'pause', data=False).success
+                print(f'three services answered in {time.monotonic() - began:.2f} s')
+                observer.spin_until(
+                    lambda: observer.call(Trigger, 'save_snapshot').success, 'a frame')
+            assert player.poll() is None, 'the recording was too short for this test'
+        finally:
+            player.kill()
+            player.wait()
+        assert node.stop() == 0

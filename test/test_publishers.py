@@ -1,0 +1,158 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What is sent when, and how points look to a viewer."""
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from gr2t_ros.core.colour import colours
+from gr2t_ros.core.view_mesh import ViewMesh
+from gr2t_ros.settings import Settings
+
+pytest.importorskip('rclpy', reason='ROS 2 is not installed')
+
+from rclpy.serialization import deserialize_message
+from ros_for_tests import Isolation, Observer
+from sensor_msgs.msg import PointCloud2
+from visualization_msgs.msg import Marker, MarkerArray
+
+from gr2t_ros.ros import publishers
+from gr2t_ros.ros.publishers import cloud, MapPublishers, outputs_profile, point_cloud
+
+
+def mesh(faces: int = 2, likelihood: float = 1.0) -> ViewMesh:
+    """Return a strip of triangles."""
+    corners = np.arange(faces + 2)
+    return ViewMesh(
+        vertices=np.column_stack([corners // 2, corners % 2, 0 * corners]).astype(float),
+        vertex_likelihood=np.full(len(corners), likelihood, np.float32),
+        faces=np.column_stack([corners[:-2], corners[1:-1], corners[2:]]).astype(np.int32),
+        edges=np.zeros((0, 2), np.int32), edge_likelihood=np.zeros(0, np.float32))
+
+
+class Map:
+    """A reconstruction that notes for which keyframes it is asked."""
+
+    def __init__(self, *meshes: ViewMesh) -> None:
+        self.keyframes = list(meshes)
+        self.asked: list[int] = []
+        self.scale = 1.0
+
+    def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
+        self.asked.append(keyframe)
+        return self.keyframes[keyframe]
+
+    def colour_scale(self) -> float:
+        return self.scale
+
+
+@pytest.fixture
+def observer() -> Iterator[Observer]:
+    observer = Observer(Isolation())
+    yield observer
+    observer.close()
+
+
+class Viewer:
+    """A subscriber of ~/mesh and the markers that it has."""
+
+    def __init__(self, observer: Observer) -> None:
+        self._observer = observer
+        self.messages = observer.collect(MarkerArray, 'observer/mesh', outputs_profile(10))
+
+    def next(self) -> dict[int, int]:
+        """Wait for a message and return its markers: id -> number of corners."""
+        self._observer.spin_until(lambda: self.messages, 'markers')
+        array = deserialize_message(self.messages.pop(0), MarkerArray)
+        for marker in array.markers:
+            assert marker.action == (Marker.ADD if marker.points else Marker.DELETE)
+        return {marker.id: len(marker.points) for marker in array.markers}
+
+
+def test_changed_meshes_only_and_all_for_a_newcomer(observer: Observer) -> None:
+    outputs = MapPublishers(observer.node, Settings())
+    reconstruction = Map(mesh(1), mesh(2), mesh(3))
+
+    outputs.change([0, 1, 2])
+    outputs.publish(reconstruction, 'map', 0, 1)
+    assert reconstruction.asked == [], 'nobody listens'
+
+    viewer = Viewer(observer)
+    publish_until_heard(outputs, reconstruction, observer, viewer)
+    assert viewer.next() == {0: 3, 1: 6, 2: 9}
+
+    reconstruction.asked.clear()
+    outputs.publish(reconstruction, 'map', 0, 1)
+    assert reconstruction.asked == [], 'nothing changed'
+
+    reconstruction.keyframes[1] = mesh(0)
+    outputs.change([1])
+    outputs.publish(reconstruction, 'map', 0, 1)
+    assert viewer.next() == {1: 0}, 'an empty mesh is deleted'
+    assert reconstruction.asked == [1]
+
+    late = Viewer(observer)
+    assert late.next() == {0: 3, 1: 6, 2: 9}, 'transient local keeps the last messages'
+    assert late.next() == {1: 0}
+    publish_until_heard(outputs, reconstruction, observer, late)
+    assert late.next() == {0: 3, 1: 0, 2: 9}
+
+
+def publish_until_heard(
+    outputs: MapPublishers, reconstruction: Map, observer: Observer, viewer: Viewer
+) -> None:
+    def heard() -> bool:
+        outputs.publish(reconstruction, 'map', 0, 1)
+        return bool(viewer.messages)
+
+    observer.spin_until(heard, 'the publisher to see the subscriber')
+
+
+def test_large_maps_go_in_parts(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishers, '_MAX_CORNERS', 10)
+    outputs = MapPublishers(observer.node, Settings())
+    reconstruction = Map(mesh(3), mesh(3), mesh(3))
+    viewer = Viewer(observer)
+    publish_until_heard(outputs, reconstruction, observer, viewer)
+    assert viewer.next() == {0: 9, 1: 9}
+    outputs.publish(reconstruction, 'map', 0, 1)
+    assert viewer.next() == {2: 9}
+
+
+def test_colours_follow_the_scale(observer: Observer) -> None:
+    """A change that one would see sends all meshes again."""
+    outputs = MapPublishers(observer.node, Settings())
+    reconstruction = Map(mesh(1), mesh(2))
+    viewer = Viewer(observer)
+    publish_until_heard(outputs, reconstruction, observer, viewer)
+    viewer.next()
+    reconstruction.scale = 0.55  # of two views: of all kernels a little more than before
+    outputs.change([0])
+    outputs.publish(reconstruction, 'map', 0, 2)
+    assert viewer.next() == {0: 3}
+    reconstruction.scale = 1.1
+    outputs.change([0])
+    outputs.publish(reconstruction, 'map', 0, 2)
+    assert viewer.next() == {0: 3, 1: 6}
+
+
+def test_a_cloud_as_viewers_read_it() -> None:
+    """Likelihoods of all keyframes are those of now, however old their clouds are."""
+    old, new = cloud(mesh(2, 0.8), views=1), cloud(mesh(2, 0.5), views=2)
+    message = point_cloud([old, new], 2, 0.5, 'turbo')
+    assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
+        (name, 4 * i, 7) for i, name in enumerate(('x', 'y', 'z', 'rgb', 'likelihood'))]
+    points = np.frombuffer(message.data, np.float32).reshape(message.width, -1)
+    np.testing.assert_array_equal(points[:4, :3], mesh(2).vertices)
+    np.testing.assert_allclose(points[:, 4], [0.4] * 4 + [0.5] * 4)
+    rgb = np.frombuffer(message.data, np.uint8).reshape(message.width, -1)[:, 14:11:-1]
+    np.testing.assert_array_equal(rgb, colours(points[:, 4], 0.5, 'turbo'))
+    assert message.row_step == len(message.data)
+
+
+def test_too_many_points_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(publishers, 'MAX_POINTS', 10)
+    message = point_cloud([cloud(mesh(23), 1)], 1, 1.0, 'turbo')
+    assert message.width == 9
+    assert isinstance(message, PointCloud2)

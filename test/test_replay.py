@@ -1,0 +1,200 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""A recording becomes a mesh, a picture and a report, whatever happens on the way."""
+from collections.abc import Callable
+from functools import partial
+import json
+import os
+from pathlib import Path
+import signal
+from typing import Any
+
+import bags_for_tests as bags
+from bags_for_tests import DEPTH
+import cv2
+import numpy as np
+import pytest
+
+from gr2t_ros.core.reconstruction import Reconstruction, Update
+from gr2t_ros.core.view import View
+from gr2t_ros.io import ply
+from gr2t_ros.tools import cli
+
+FEW = ('-p', 'keyframe_translation:=0.03', '-p', 'threads:=1')
+
+
+def replay(*arguments: Any) -> int:
+    """Run the command."""
+    return cli.main(['replay', *map(str, arguments), *FEW])
+
+
+def report(directory: Path) -> Any:
+    """Return a run's report."""
+    return json.loads((directory / 'report.json').read_text())
+
+
+def test_a_scan_becomes_mesh_picture_and_report(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert replay(bags.write(tmp_path / 'scan', bags.scan(6)), '--per-view') == 0
+    out = tmp_path / 'scan_gr2t'  # where no folder is named
+    mesh = ply.read(out / 'mesh.ply')
+    # a wall with 2 mm of noise, a metre away; the camera moves 2 cm a frame
+    assert np.abs(mesh.mesh.vertices[:, 2] - 1).mean() < 0.001
+    assert len(mesh.mesh.faces) > 2500
+    assert sorted(set(mesh.vertex_view)) == [0, 1, 2]
+    found = report(out)
+    assert found['frames'] == {'read': 6, 'integrated': 6, 'keyframes': 3, 'dropped': {}}
+    assert found['mesh'] == {'vertices': len(mesh.mesh.vertices),
+                             'edges': len(mesh.mesh.edges), 'faces': len(mesh.mesh.faces)}
+    assert found['likelihood']['max'] == mesh.mesh.vertex_likelihood.max()
+    assert found['rays']['marched'] == 3 * bags.WIDTH * bags.HEIGHT
+    assert found['settings']['world_frame'] == 'map'
+    assert found['input_damage'] == ''
+    views = sorted((out / 'views').iterdir())
+    assert [path.name for path in views] == ['view_0000.ply', 'view_0001.ply', 'view_0002.ply']
+    parts = [ply.read(path).mesh.vertices for path in views]
+    np.testing.assert_array_equal(np.concatenate(parts), mesh.mesh.vertices)
+    assert cv2.imread(str(out / 'preview.png')).std() > 10
+    printed = capsys.readouterr()
+    for name in ('mesh.ply', 'preview.png', 'report.json', 'views'):
+        assert f'scan_gr2t/{name}' in printed.out
+    assert f'{DEPTH} (6 images; rectified' in printed.err
+    assert 'keyframe_translation:=0.03' in printed.err
+
+
+def test_a_mesh_of_too_many_faces_is_decimated_and_its_views_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(ply, 'write_views', partial(ply.write_views, max_faces=2000))
+    path = bags.write(tmp_path / 'scan', bags.scan(6))
+    assert replay(path, '-o', tmp_path / 'out', '--per-view') == 0
+    assert 'decimated by 2 in rows and columns' in capsys.readouterr().out
+    assert report(tmp_path / 'out')['mesh']['faces'] < 2000
+    views = sorted((tmp_path / 'out' / 'views').iterdir())
+    assert [len(ply.read(view).mesh.faces) > 1000 for view in views] == [True] * 3
+
+
+def test_bad_frames_are_counted_and_the_rest_still_reconstruct(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shape = (bags.HEIGHT, bags.WIDTH)
+    others = {
+        1: bags.image(1, data=np.zeros(shape, np.uint16)),
+        2: bags.image(2, data=np.ones(shape, np.uint8), encoding='8UC1'),
+        3: bags.image(3, data=np.full((8, 8), 1000, np.uint16)),
+        4: bags.image(4, data=np.ones(shape, np.uint16)),
+        20: bags.image(20)}
+    messages = [message for message in bags.scan(6)
+                if not (message.topic == DEPTH
+                        and message.log_ns in {other.log_ns for other in others.values()})]
+    assert replay(bags.write(tmp_path / 'scan', [*messages, *others.values()]),
+                  '-o', tmp_path / 'out') == 0
+    frames = report(tmp_path / 'out')['frames']
+    assert (frames['read'], frames['integrated']) == (7, 2)
+    assert sum(frames['dropped'].values()) == 5
+    assert frames['dropped'].items() >= {
+        'no_valid_depth': 1, 'encoding': 1, 'image_size': 1, 'depth_unit': 1}.items()
+    out = capsys.readouterr().out
+    assert "dropped  1 encoding: depth image has encoding '8UC1'" in out
+    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 500
+
+
+def test_start_and_max_frames_choose_a_part(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / 'scan', bags.scan(8))
+    assert replay(path, '-o', tmp_path / 'out', '--start', 0.3, '--max-frames', 2) == 0
+    assert report(tmp_path / 'out')['frames']['integrated'] == 2
+    # the camera's way begins where it was at the fourth image
+    mesh = ply.read(tmp_path / 'out' / 'mesh.ply').mesh
+    assert mesh.vertices[:, 0].min() > 0.02 * 3 - 0.55
+
+
+def test_a_start_after_the_end_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bags.write(tmp_path / 'scan', bags.scan(3))
+    assert replay(path, '-o', tmp_path / 'out', '--start', 9) == 2
+    assert '--start 9 s is after the end of' in capsys.readouterr().err
+
+
+def during_frame(
+    number: int, action: Callable[[], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Let something happen while the frame of a number is added."""
+    add, count = Reconstruction.add, iter(range(1000))
+
+    def adds(self: Reconstruction, view: View) -> Update:
+        if next(count) == number + 2:  # two are added to warm up
+            action()
+        return add(self, view)
+    monkeypatch.setattr(Reconstruction, 'add', adds)
+
+
+def test_an_interrupt_saves_what_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    during_frame(3, lambda: os.kill(os.getpid(), signal.SIGINT), monkeypatch)
+    before = signal.getsignal(signal.SIGINT)
+    assert replay(bags.write(tmp_path / 'scan', bags.scan(8)), '-o', tmp_path / 'out') == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    frames = report(tmp_path / 'out')['frames']
+    assert (frames['read'], frames['integrated']) == (4, 4)
+    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 500
+    assert 'stopping after this frame' in capsys.readouterr().err
+
+
+def test_a_second_interrupt_is_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def twice() -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+    during_frame(3, twice, monkeypatch)
+    assert replay(bags.write(tmp_path / 'scan', bags.scan(8)), '-o', tmp_path / 'out') == 130
+    assert not list((tmp_path / 'out').iterdir())
+
+
+def test_a_failure_midway_keeps_what_is_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail() -> None:
+        raise RuntimeError('out of order')
+    during_frame(3, fail, monkeypatch)
+    assert replay(bags.write(tmp_path / 'scan', bags.scan(8)), '-o', tmp_path / 'out') == 1
+    assert report(tmp_path / 'out')['frames']['integrated'] == 3
+    assert capsys.readouterr().err.splitlines()[-1] == (
+        'gr2t: unexpected RuntimeError: out of order (--debug shows where)')
+
+
+def test_a_damaged_recording_is_used_as_far_as_it_reads(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    # most of the file is a topic that nobody reads: damage there ends no run, damage in a chunk
+    # that holds images does
+    large = np.random.default_rng(0).integers(0, 1000, (240, 320), np.uint16)
+    messages = [*bags.scan(20),
+                *(bags.image(i, '/camera/aligned/image', large) for i in range(20))]
+    path = bags.write(tmp_path / 'scan', messages, 'rosbag1 bz2')
+    content = bytearray(path.read_bytes())
+    middle = len(content) // 2
+    content[middle:middle + 100] = bytes(100)
+    path.write_bytes(content)
+    assert replay(path, '-o', tmp_path / 'out') == 0
+    found = report(tmp_path / 'out')
+    assert 0 < found['frames']['integrated'] < 20
+    assert f'{path} is damaged: used up to' in found['input_damage']
+    assert 'damage   ' in capsys.readouterr().out
+
+
+def test_the_kitchen_needs_no_option_but_patience(data: Path, tmp_path: Path) -> None:
+    assert cli.main([
+        'replay', str(data / 'bags' / 'kitchen_sweep'), '-o', str(tmp_path / 'out'),
+        '--max-frames', '4', '-p', 'ray_stride:=8']) == 0
+    found = report(tmp_path / 'out')
+    assert found['frames']['integrated'] == 4
+    assert found['frames']['dropped'] == {}
+    assert found['settings']['world_frame'] == 'map'
+    vertices = ply.read(tmp_path / 'out' / 'mesh.ply').mesh.vertices
+    assert len(vertices) > 1000
+    assert np.all(np.ptp(vertices, axis=0) < 10)  # a room

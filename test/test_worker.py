@@ -1,0 +1,260 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""The worker without ROS: it is fed with a recording's messages."""
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes_for_tests import looking_at_origin, plane_view
+
+from gr2t_ros.core.camera import Camera
+from gr2t_ros.core.reconstruction import Reconstruction, Update
+from gr2t_ros.core.view import View
+from gr2t_ros.errors import InputError
+from gr2t_ros.io.bags import Bag
+from gr2t_ros.io.ply import read
+from gr2t_ros.ros.worker import Worker
+from gr2t_ros.settings import Settings
+from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
+
+LIMIT = 60.0  # s
+COUNT = 5
+
+
+class Outputs:
+    """Remembers what it is told."""
+
+    def __init__(self) -> None:
+        self.changed: set[int] = set()
+        self.published: list[tuple[str, int, int]] = []
+        self.cleared: list[str] = []
+
+    def change(self, keyframes: Any) -> None:
+        self.changed.update(keyframes)
+
+    def publish(
+        self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
+    ) -> None:
+        self.published.append((frame_id, stamp_ns, views))
+
+    def clear(self, frame_id: str) -> None:
+        self.cleared.append(frame_id)
+
+
+class Log:
+    """Keeps lines."""
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.info = self.warning = self.error = self.lines.append
+
+
+class Rig:
+    """A worker with its outputs, and the messages of a recording."""
+
+    def __init__(self, bag: Path, settings: Settings) -> None:
+        self.outputs = Outputs()
+        self.log = Log()
+        self.worker = Worker(settings, self.outputs, self.log, rectified=True)
+        with Bag([bag]) as opened:
+            self.messages = [
+                (topic, message) for topic, message, _ in opened.messages(opened.topics)]
+        self.images = [message for topic, message in self.messages if topic == DEPTH_TOPIC]
+
+    def feed(self, *topics: str) -> None:
+        """Hand over all messages of these topics; of all where none is named."""
+        hands: dict[str, Callable[[Any], None]] = {
+            DEPTH_TOPIC: self.worker.on_depth,
+            CAMERA_INFO_TOPIC: self.worker.on_camera_info,
+            '/tf': lambda message: self.worker.on_transforms(message, static=False),
+            '/tf_static': lambda message: self.worker.on_transforms(message, static=True)}
+        for topic, message in self.messages:
+            if topic in (topics or hands):
+                hands[topic](message)
+
+    def wait(self, condition: Callable[[], Any], what: str) -> None:
+        end = time.monotonic() + LIMIT
+        while not condition():
+            assert time.monotonic() < end, f'waited in vain for {what}: {self.log.lines}'
+            time.sleep(0.005)
+
+    def said(self, text: str) -> int:
+        """Return how often a line with such a text was logged."""
+        return sum(text in line for line in self.log.lines)
+
+
+@pytest.fixture(scope='module')
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of a plane."""
+    camera = Camera(48, 36, 45.0, 45.0, 23.5, 17.5)
+    path = tmp_path_factory.mktemp('bags') / 'plane'
+    record(path, [
+        replace(
+            plane_view(
+                camera, looking_at_origin((np.cos(i / 3), np.sin(i / 3), 2), 0.6), (0, 0, 1), 0.0),
+            stamp_ns=1_700_000_000_000_000_000 + i * 100_000_000)
+        for i in range(COUNT)])
+    return path
+
+
+@pytest.fixture
+def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
+    """Return a function that makes a running worker with some parameters."""
+    rigs = []
+
+    def rig(start: bool = True, **values: object) -> Rig:
+        settings = Settings().updated({
+            'publish_rate': 60.0, 'snapshot_directory': str(tmp_path / 'snapshots'), **values})
+        rigs.append(Rig(bag, settings))
+        if start:
+            rigs[-1].worker.start()
+        return rigs[-1]
+
+    yield rig
+    for item in rigs:
+        if item.worker.alive:
+            item.worker.stop()
+
+
+def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.outputs.published[-1:] and rig.outputs.published[-1][2] == COUNT,
+             'the last frame\'s publication')
+    frame, stamp_ns, _ = rig.outputs.published[-1]
+    assert frame == 'map'
+    assert stamp_ns == 1_700_000_000_400_000_000
+    assert rig.outputs.changed == set(range(max(rig.outputs.changed) + 1))
+    assert rig.worker.dropped == {}
+    rig.worker.stop()
+    assert '5 received, 5 integrated, 0 dropped, 0 waiting' in rig.worker.summary()
+
+
+def test_a_full_queue_loses_the_oldest_images(make: Callable[..., Rig]) -> None:
+    rig = make(start=False, queue_size=2)
+    rig.feed()
+    assert rig.worker.dropped == {'queue_full': COUNT - 2}
+    rig.worker.start()
+    rig.wait(lambda: rig.worker.integrated == 2, 'the other frames')
+    rig.wait(lambda: rig.outputs.published, 'a publication')
+    rig.wait(lambda: rig.outputs.published[-1][1] == 1_700_000_000_400_000_000, 'the newest')
+    assert rig.said('queue_full') == 1
+
+
+def test_one_frame_that_fails_costs_itself_only(
+    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add = Reconstruction.add
+
+    def fails_once(self: Reconstruction, view: View) -> Update:
+        if view.stamp_ns == 1_700_000_000_200_000_000:
+            raise ZeroDivisionError('a defect')
+        return add(self, view)
+
+    monkeypatch.setattr(Reconstruction, 'add', fails_once)
+    rig = make()
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT - 1, 'the other frames')
+    assert rig.worker.dropped == {'error': 1}
+    assert rig.said('the frame of 1700000000.200 s failed: ZeroDivisionError: a defect') == 1
+
+
+def test_paused_images_are_counted(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.worker.pause(True)
+    rig.feed()
+    assert rig.worker.dropped == {'paused': COUNT}
+    rig.worker.pause(False)
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'the frames after the pause')
+
+
+def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
+    rig = make()
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.worker.reset()
+    with pytest.raises(InputError, match='nothing to save'):
+        rig.worker.snapshot().result(LIMIT)
+    assert rig.outputs.cleared == ['map']
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == 2 * COUNT, 'the frames after the reset')
+    assert rig.worker.snapshot().result(LIMIT).vertices > 0
+
+
+def test_reset_and_pause_do_not_wait_for_a_frame(
+    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What waits when a reset comes is not part of the new map."""
+    add, go, busy = Reconstruction.add, threading.Event(), threading.Event()
+
+    def slow(self: Reconstruction, view: View) -> Update:
+        busy.set()
+        assert go.wait(LIMIT)
+        return add(self, view)
+
+    monkeypatch.setattr(Reconstruction, 'add', slow)
+    rig = make()
+    rig.feed()
+    assert busy.wait(LIMIT)
+    rig.worker.reset()
+    rig.worker.pause(True)
+    answer = rig.worker.snapshot()
+    go.set()
+    with pytest.raises(InputError, match='nothing to save'):
+        answer.result(LIMIT)
+    assert rig.worker.dropped == {'reset': COUNT - 1}
+    assert rig.outputs.cleared == ['map']
+
+
+def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path) -> None:
+    rig = make()
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    paths = [rig.worker.snapshot().result(LIMIT).path for _ in range(3)]
+    assert len(set(paths)) == 3
+    for path in paths:
+        assert path.parent == tmp_path / 'snapshots'
+        assert np.abs(read(path).mesh.vertices[:, 2]).max() < 0.02
+
+
+def test_a_snapshot_on_exit_where_asked(make: Callable[..., Rig], tmp_path: Path) -> None:
+    for wanted in (False, True):
+        rig = make(snapshot_on_exit=wanted)
+        rig.feed()
+        rig.wait(lambda rig=rig: rig.worker.integrated == COUNT, 'all frames')
+        rig.worker.stop()
+        assert len(list(tmp_path.glob('snapshots/*.ply'))) == wanted
+
+
+def test_a_folder_that_cannot_be_made_is_named(make: Callable[..., Rig], tmp_path: Path) -> None:
+    (tmp_path / 'file').write_text('')
+    rig = make(snapshot_directory=str(tmp_path / 'file' / 'inside'))
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    with pytest.raises(Exception, match='file/inside'):
+        rig.worker.snapshot().result(LIMIT)
+
+
+def test_images_whose_pose_never_comes_are_given_up(make: Callable[..., Rig]) -> None:
+    """Also when no more messages arrive; the reason is said once."""
+    rig = make(max_wait_for_pose=0.05)
+    rig.feed(DEPTH_TOPIC, CAMERA_INFO_TOPIC, '/tf_static')
+    rig.wait(lambda: sum(rig.worker.dropped.values()) == COUNT, 'the images to be given up')
+    (reason, count), = rig.worker.dropped.items()
+    assert count == COUNT
+    assert rig.said(f'[{reason}: said once') == 1
+
+
+def test_rays_that_wait_are_marched_when_idle(make: Callable[..., Rig]) -> None:
+    """Without time for older rays while frames come, the map is complete soon after."""
+    rig = make(remarch_budget=0.0, keyframe_translation=0.0)
+    rig.feed()
+    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.worker.waiting_rays == 0, 'the older rays')
