@@ -49,6 +49,13 @@ class Settings:
         0.002, 'Growth of h3 with the square of the depth: h3(z) = depth_bandwidth + this z^2.',
         unit='1/m', low=0.0, high=1.0)
 
+    density: str = _parameter(
+        'voxel', 'How the density is kept: sampled on a lattice, at a fixed cost per frame, or '
+        'exact, as the reference for short recordings.', choices=('voxel', 'exact'))
+    voxel_size: float = _parameter(
+        0.0, 'Spacing of the lattice; h3 is never below it. 0: h3 at the median depth of the '
+        'first frame.', unit='m', low=0.0, high=1.0)
+
     # the rays and the meshes
     start: str = _parameter(
         'robust', 'Where a ray starts: at its observed depth, or (robust) at a neighbour\'s depth '
@@ -71,7 +78,7 @@ class Settings:
         1000, 'Keyframes kept; later ones still add to the density (reported).',
         low=1, high=1_000_000)
     remarch_budget: float = _parameter(
-        0.1, 'Time per frame for marching older rays again; what is left waits, and is done '
+        0.02, 'Time per frame for marching older rays again; what is left waits, and is done '
         'before a snapshot or at the end.', unit='s', low=0.0, high=60.0)
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)

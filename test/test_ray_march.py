@@ -22,9 +22,9 @@ def density_of(views, h3=H3, quadratic=0.0):
     return density
 
 
-def marched(density, view, index=0, start='robust', pool=None):
-    rays = rays_of(density, index, view, 1, start, pool)
-    march(density, rays, np.ones(len(rays.pixels), bool), pool)
+def marched(density, view, start='robust', pool=None):
+    rays = rays_of(density, view, 1, start, pool)
+    march(density, rays, np.arange(len(rays.pixels)), pool)
     return rays
 
 
@@ -42,7 +42,7 @@ def test_a_tilted_plane_is_found_where_it_is():
         plane_view(CAMERA, pose(r, t), normal, 0.6) for r, t in (
             ([0, 0, 0], [0, 0, 0]), ([0, 0.1, 0], [-0.05, 0, 0]), ([0.1, 0, 0.2], [0, 0.04, 0]))]
     rays = marched(density_of(views), views[0])
-    points = rays.origin + rays.depth[:, None] * rays.direction
+    points = rays.points(slice(None))
     # a window that an image's border cuts is one-sided, so ask where all views have whole ones
     middle = np.all([inside(view, points, 7) for view in views], axis=0)
     assert middle.sum() > 1000 and rays.converged[middle].all()
@@ -55,7 +55,7 @@ def test_a_sphere_shrinks_by_what_its_curvature_predicts():
     radius, distance = 0.1, 0.5
     view = sphere_view(CAMERA, looking_at_origin([1, 0, 0], distance), radius)
     rays = marched(density_of([view], h3=0.002), view)
-    points = rays.origin + rays.depth[:, None] * rays.direction
+    points = rays.points(slice(None))
     frontal = np.linalg.norm(points[:, 1:], axis=1) < 0.01
     lateral = 1.5 * (distance - radius) / CAMERA.fx
     sunk = radius - np.linalg.norm(points[frontal], axis=1)
@@ -65,12 +65,12 @@ def test_a_sphere_shrinks_by_what_its_curvature_predicts():
 def test_every_converged_ray_is_at_a_maximum():
     views = bumpy_views()
     density = density_of(views, 0.004, 0.002)
-    for index, view in enumerate(views):
-        rays = marched(density, view, index)
+    for view in views:
+        rays = marched(density, view)
         assert rays.converged.mean() > 0.97
         ok = rays.converged
         origins = np.repeat(rays.origin[None], ok.sum(), axis=0)
-        f, f1, f2 = density.along(origins, rays.direction[ok], rays.depth[ok].astype(float))
+        f, f1, f2 = density.along(origins, rays.directions(ok), rays.depth[ok].astype(float))
         h3 = density.h3(rays.start[ok])
         assert (f2 < 0).all()
         # f jumps a little where a pixel enters the window: nearly all are at the very top
@@ -78,7 +78,7 @@ def test_every_converged_ray_is_at_a_maximum():
         assert (np.abs(rays.depth - rays.start)[ok] <= 4 * h3 * (1 + 1e-6)).all()
         # the likelihood handed out is the density's there
         np.testing.assert_allclose(
-            rays.total[ok] / density.views.size, f, rtol=2e-4)
+            rays.total[ok] / density.size, f, rtol=2e-4)
 
 
 def test_the_robust_start_brings_outliers_back_and_leaves_the_rest():
@@ -134,7 +134,7 @@ def test_threads_do_not_change_a_bit():
     with ThreadPoolExecutor(1) as one, ThreadPoolExecutor(4) as four:
         a = marched(density, views[0], pool=one)
         b = marched(density, views[0], pool=four)
-        points = views[0].T_world_camera[:3, 3] + a.depth[:, None] * a.direction
+        points = a.points(slice(None))
         np.testing.assert_array_equal(
             density.likelihood(points, one), density.likelihood(points, four))
     for name in ('start', 'depth', 'total', 'status', 'iterations'):
@@ -145,8 +145,8 @@ def test_stride_takes_a_subset_of_the_same_rays():
     views = bumpy_views()
     density = density_of(views, 0.004, 0.002)
     whole = marched(density, views[0])
-    sparse = rays_of(density, 0, views[0], 3, 'robust')
-    march(density, sparse, np.ones(len(sparse.pixels), bool))
+    sparse = rays_of(density, views[0], 3, 'robust')
+    march(density, sparse, np.arange(len(sparse.pixels)))
     at = np.searchsorted(whole.pixels, sparse.pixels)
     np.testing.assert_array_equal(whole.depth[at], sparse.depth)
     assert 7 < len(whole.pixels) / len(sparse.pixels) < 11

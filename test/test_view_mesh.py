@@ -20,8 +20,8 @@ def mesh_of(depth, stride=1, T=None, **thresholds):
     view = View(depth.astype(np.float32), CAMERA, T, 0)
     density = ExactDensity(1.5, 0.003)
     density.add(view)
-    rays = rays_of(density, 0, view, 1, 'robust')
-    march(density, rays, np.ones(len(rays.pixels), bool))
+    rays = rays_of(density, view, 1, 'robust')
+    march(density, rays, np.arange(len(rays.pixels)))
     return density, view_mesh(
         density, rays, WIDTH, stride, thresholds.get('vertex', 0.02), thresholds.get('edge', 0.5))
 

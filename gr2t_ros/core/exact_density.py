@@ -63,8 +63,19 @@ class Views(NamedTuple):
     far: Doubles
 
 
+class ViewSum(NamedTuple):
+    """The density as the kernels evaluate it."""
+
+    views: Views
+    window: Window
+
+
 class Scratch(NamedTuple):
-    """What one thread writes while it sums; made by new_scratch."""
+    """
+    What one thread writes while it sums; made by new_scratch.
+
+    :param nearby: how many views count on the line at hand, then which
+    """
 
     columns: Floats
     rows: Floats
@@ -89,9 +100,10 @@ class ExactDensity:
     ) -> None:
         if not (pixel_bandwidth > 0 and depth_bandwidth > 0 and depth_bandwidth_quadratic >= 0):
             raise InputError('bandwidths must be positive')
-        self.depth_bandwidth = depth_bandwidth
-        self.depth_bandwidth_quadratic = depth_bandwidth_quadratic
+        # h3(z) = max(constant + quadratic z^2, floor)
+        self.bandwidth = (float(depth_bandwidth), float(depth_bandwidth_quadratic), 0.0)
         self.truncation = truncation
+        self.pixel_bandwidth = float(pixel_bandwidth)
         self.window = Window.of(pixel_bandwidth, truncation)
         self._views = Views(
             0, np.zeros((1, 3, 4)), np.zeros((1, 14)), np.zeros((1, 7), np.int64), np.zeros(1),
@@ -100,21 +112,27 @@ class ExactDensity:
         self._cells = 0
 
     @property
-    def views(self) -> Views:
-        """Return the views added so far, for the kernels."""
-        return self._views
+    def state(self) -> ViewSum:
+        """Return what the kernels need."""
+        return ViewSum(self._views, self.window)
+
+    @property
+    def size(self) -> int:
+        """Return the number of views added so far."""
+        return self._views.size
+
+    @property
+    def change(self) -> int:
+        """Return the number of the last change: rays marched before it may be stale."""
+        return self._views.size
 
     def h3(self, depth: Doubles | Floats) -> Doubles:
         """Return the bandwidth along the depth, metres, at depths in metres."""
-        z = np.asarray(depth, np.float64)
-        return self.depth_bandwidth + self.depth_bandwidth_quadratic * z * z
+        constant, quadratic, _ = self.bandwidth
+        return constant + quadratic * np.asarray(depth, np.float64) ** 2
 
-    def add(self, view: View) -> int:
-        """
-        Add a view's kernels.
-
-        :return: its index in views
-        """
+    def add(self, view: View, pool: Executor | None = None) -> None:
+        """Add a view's kernels."""
         width, height = view.camera.width, view.camera.height
         before = ceil(2 * self.window.reach)
         stride = width + before + self.window.lanes
@@ -154,7 +172,9 @@ class ExactDensity:
             _appended(v.far, self._cells, far.ravel()))
         self._pixels += depth.size
         self._cells += near.size
-        return c
+
+    def refresh(self, pool: Executor | None = None) -> None:
+        """Do nothing: the sum is always up to date."""
 
     def likelihood(self, points: Doubles, pool: Executor | None = None) -> Doubles:
         """
@@ -167,7 +187,7 @@ class ExactDensity:
         points = np.ascontiguousarray(points, np.float64)
         out = np.zeros(len(points))
         tasks = [
-            (self._views, self.window, points[i:i + _CHUNK], out[i:i + _CHUNK])
+            (self.state, points[i:i + _CHUNK], out[i:i + _CHUNK])
             for i in range(0, len(points), _CHUNK)]
         if pool is None:
             for task in tasks:
@@ -188,7 +208,7 @@ class ExactDensity:
         :return: f, f', f'', each (n,) float64; f in 1 / (px^2 m)
         """
         jets = _jets(
-            self._views, self.window, np.ascontiguousarray(origins, np.float64),
+            self.state, np.ascontiguousarray(origins, np.float64),
             np.ascontiguousarray(directions, np.float64),
             np.ascontiguousarray(distances, np.float64)) / max(self._views.size, 1)
         return jets[:, 0], jets[:, 1], jets[:, 2]
@@ -232,11 +252,12 @@ def _depth_ranges(
 
 
 @njit(cache=True, nogil=True)
-def new_scratch(window: Window, views: Views) -> Scratch:
+def new_scratch(state: ViewSum) -> Scratch:
     """Make one thread's scratch arrays."""
+    lanes = state.window.lanes
     return Scratch(
-        np.zeros((3, window.lanes), np.float32), np.zeros((3, window.lanes), np.float32),
-        np.zeros(3 * window.lanes, np.float32), np.zeros(max(views.size, 1), np.int64))
+        np.zeros((3, lanes), np.float32), np.zeros((3, lanes), np.float32),
+        np.zeros(3 * lanes, np.float32), np.zeros(1 + state.views.size, np.int64))
 
 
 @njit(cache=True, nogil=True)
@@ -275,7 +296,33 @@ def _supported(
 
 
 @njit(cache=True, nogil=True)
-def sees(
+def prepare(
+    state: ViewSum, scratch: Scratch, origin: Doubles, direction: Doubles,
+    low: float, high: float,
+) -> None:
+    """Note the views that may have a share of the density on a piece of a line."""
+    count = 0
+    for c in range(state.views.size):
+        if _sees(state.views, state.window, c, origin, direction, low, high):
+            count += 1
+            scratch.nearby[count] = c
+    scratch.nearby[0] = count
+
+
+@njit(cache=True, nogil=True)
+def changed_since(
+    state: ViewSum, scratch: Scratch, origin: Doubles, direction: Doubles,
+    low: float, high: float, change: int,
+) -> bool:
+    """Tell whether a view added after a change may have a share on a piece of a line."""
+    for c in range(change, state.views.size):
+        if _sees(state.views, state.window, c, origin, direction, low, high):
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _sees(
     views: Views, window: Window, c: int, origin: Doubles, direction: Doubles,
     low: float, high: float,
 ) -> bool:
@@ -311,19 +358,19 @@ def sees(
 
 @njit(cache=True, nogil=True)
 def jet_along(
-    views: Views, window: Window, scratch: Scratch, nearby: int,
-    origin: Doubles, direction: Doubles, distance: float, h3: float,
+    state: ViewSum, scratch: Scratch, origin: Doubles, direction: Doubles, distance: float,
+    h3: float,
 ) -> tuple[float, float, float, float]:
     """
-    Sum the views' density and its derivatives at a point of a world line.
+    Sum the prepared views' density and its derivatives at a point of a world line.
 
-    :param nearby: how many of scratch.nearby name the views that count
     :param h3: bandwidth along the depth there, metres
     :return: C f, C f', C f'', and g such that f'/g is the mean-shift step
     """
     f, f1, f2, g = 0.0, 0.0, 0.0, 0.0
-    for n in range(nearby):
-        c = scratch.nearby[n]
+    views, window = state.views, state.window
+    for n in range(scratch.nearby[0]):
+        c = scratch.nearby[n + 1]
         x, x1, y, y1, z, z1 = _camera_line(views, c, origin, direction, distance)
         seen, u, u1, u2, v, v1, v2 = project_jet(views.camera[c], x, x1, y, y1, z, z1)
         if not seen or not _supported(views, window, c, u, v, z):
@@ -345,9 +392,10 @@ def jet_along(
 
 
 @njit(cache=True, nogil=True)
-def _values(views: Views, window: Window, points: Doubles, out: Doubles) -> None:
+def _values(state: ViewSum, points: Doubles, out: Doubles) -> None:
     """Write C f at world points (n, 3) to out (n,)."""
-    scratch = new_scratch(window, views)
+    scratch = new_scratch(state)
+    views, window = state.views, state.window
     still = np.zeros(3)
     for i in range(len(points)):
         total = 0.0
@@ -368,14 +416,15 @@ def _values(views: Views, window: Window, points: Doubles, out: Doubles) -> None
 
 @njit(cache=True, nogil=True)
 def _jets(
-    views: Views, window: Window, origins: Doubles, directions: Doubles, distances: Doubles
+    state: ViewSum, origins: Doubles, directions: Doubles, distances: Doubles
 ) -> Doubles:
-    scratch = new_scratch(window, views)
+    scratch = new_scratch(state)
     out = np.zeros((len(origins), 3))
-    for c in range(views.size):
-        scratch.nearby[c] = c
+    scratch.nearby[0] = state.views.size
+    for c in range(state.views.size):
+        scratch.nearby[c + 1] = c
     for i in range(len(origins)):
         f, f1, f2, _ = jet_along(
-            views, window, scratch, views.size, origins[i], directions[i], distances[i], 1.0)
+            state, scratch, origins[i], directions[i], distances[i], 1.0)
         out[i, 0], out[i, 1], out[i, 2] = f, f1, f2
     return out

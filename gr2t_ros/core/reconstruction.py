@@ -21,11 +21,13 @@ from ..errors import FrameError
 from ..settings import Settings
 from .camera import Camera
 from .exact_density import ExactDensity
-from .ray_march import affected, march, Rays, rays_of
+from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .view import View
 from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
+from .voxel_density import VoxelDensity
 
 _SLICE = 16384  # rays marched between two looks at the clock
+_ALIASED = 0.05  # share of pixels too near for the voxel size that is worth a notice
 
 
 @dataclass(eq=False)
@@ -33,12 +35,14 @@ class Keyframe:
     """
     A view that keeps its rays, and so owns a mesh.
 
-    :param waiting: (n,) bool, rays whose density changed since they were marched
+    :param blocks: the lattice's blocks that its rays need; None with the exact density
+    :param checked: the density's change up to which all its rays are right
     """
 
     view: View
     rays: Rays
-    waiting: NDArray[np.bool_]
+    blocks: NDArray[np.int32] | None
+    checked: int = -1
 
 
 @dataclass(frozen=True)
@@ -50,10 +54,10 @@ class Update:
     :param marched: rays marched for the first time
     :param remarched: rays marched again
     :param converged: of these, rays that found their maximum
-    :param waiting: rays left for a later step
+    :param waiting: rays of keyframes that are still to be looked at; not all need marching
     :param changed: keyframes whose rays were marched
     :param seconds: wall time of `integrate` and `march`
-    :param refused_keyframe: whether max_keyframes kept the view from becoming one
+    :param notices: sentences that a user should read
     """
 
     keyframe: int | None = None
@@ -63,7 +67,7 @@ class Update:
     waiting: int = 0
     changed: tuple[int, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
-    refused_keyframe: bool = False
+    notices: tuple[str, ...] = ()
 
 
 class Reconstruction:
@@ -78,11 +82,21 @@ class Reconstruction:
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
-        self.density = ExactDensity(
-            settings.pixel_bandwidth, settings.depth_bandwidth,
-            settings.depth_bandwidth_quadratic)
+        self._density: Density | None = None
+        self._noticed: set[str] = set()
         self._pool = ThreadPoolExecutor(
             settings.threads or os.cpu_count() or 1, thread_name_prefix='gr2t')
+
+    @property
+    def density(self) -> Density:
+        """
+        Return what all views built.
+
+        :raises FrameError: before the first view
+        """
+        if self._density is None:
+            raise FrameError('empty_map', 'there is no map yet: no frame was integrated')
+        return self._density
 
     def add(self, view: View) -> Update:
         """
@@ -98,31 +112,36 @@ class Reconstruction:
                 'image_size', f'depth image of shape {view.depth.shape} does not fit its camera '
                 f'of {view.camera.width} x {view.camera.height} pixels')
         began = perf_counter()
-        index = self.density.add(view)
-        for keyframe in self.keyframes:
-            keyframe.waiting |= affected(self.density, keyframe.rays, index, self._pool)
+        notices = []
+        if self._density is None:
+            self._density, notice = self._new_density(view)
+            notices += [notice] if notice else []
+        self._density.add(view, self._pool)
+        notices += self._notice_aliasing(view)
         wanted = self._is_keyframe(view)
-        full = len(self.keyframes) >= self.settings.max_keyframes
         number = None
-        if wanted and not full:
+        if wanted and len(self.keyframes) < self.settings.max_keyframes:
             number = len(self.keyframes)
-            rays = rays_of(
-                self.density, index, view, self.settings.ray_stride, self.settings.start,
-                self._pool)
-            self.keyframes.append(Keyframe(view, rays, np.ones(len(rays.pixels), np.bool_)))
+            self.keyframes.append(self._new_keyframe(view))
+        elif wanted:
+            notices += self._once(
+                'keyframes', f'max_keyframes {self.settings.max_keyframes} is reached: later '
+                'views add to the density, but own no mesh')
         integrated = perf_counter()
-        update = self._march_waiting(number, integrated + self.settings.remarch_budget)
+        update = self._march(number, integrated + self.settings.remarch_budget)
         return replace(
-            update, keyframe=number, refused_keyframe=wanted and full,
+            update, keyframe=number, notices=tuple(notices),
             seconds={'integrate': integrated - began, 'march': perf_counter() - integrated})
 
     def finish(self, budget: float = float('inf')) -> Update:
         """
-        March all rays that wait, as before a snapshot or at the end of a recording.
+        March the rays that wait, as before a snapshot or at the end of a recording.
 
-        :param budget: seconds after which what still waits is left
+        :param budget: seconds after which the rest is left waiting
         """
-        return self._march_waiting(None, perf_counter() + budget)
+        began = perf_counter()
+        update = self._march(None, began + budget)
+        return replace(update, seconds={'march': perf_counter() - began})
 
     def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
         """
@@ -148,11 +167,37 @@ class Reconstruction:
         likely = np.concatenate(totals) if totals else np.zeros(0)
         if not len(likely):
             return 0.0
-        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self.density.views.size
+        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self.density.size
 
     def close(self) -> None:
         """End the threads."""
         self._pool.shutdown()
+
+    def _new_density(self, view: View) -> tuple[Density, str]:
+        """Return an empty density for the first view, and what to say of it."""
+        s = self.settings
+        if s.density == 'exact':
+            return ExactDensity(
+                s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic), ''
+        voxel_size, notice = s.voxel_size, ''
+        if voxel_size == 0:
+            seen = view.depth[np.isfinite(view.depth)]
+            median = float(np.median(seen)) if len(seen) else s.depth_max / 2
+            voxel_size = s.depth_bandwidth + s.depth_bandwidth_quadratic * median ** 2
+            notice = (
+                f'voxel_size is {1000 * voxel_size:.3g} mm: h3 at the first frame\'s median '
+                f'depth of {median:.2f} m')
+        return VoxelDensity(
+            s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic, voxel_size,
+            s.depth_max), notice
+
+    def _new_keyframe(self, view: View) -> Keyframe:
+        rays = rays_of(
+            self.density, view, self.settings.ray_stride, self.settings.start, self._pool)
+        blocks = None
+        if isinstance(self.density, VoxelDensity):
+            blocks = watched_blocks(self.density, rays)
+        return Keyframe(view, rays, blocks)
 
     def _is_keyframe(self, view: View) -> bool:
         """Tell whether the camera has moved or turned enough since the last keyframe."""
@@ -166,29 +211,75 @@ class Reconstruction:
             moved >= self.settings.keyframe_translation
             or turned >= self.settings.keyframe_rotation)
 
-    def _march_waiting(self, new: int | None, deadline: float) -> Update:
-        """March the new keyframe's rays, then what waits on older ones, newest first."""
-        marched = remarched = converged = waiting = 0
+    def _march(self, new: int | None, deadline: float) -> Update:
+        """March the new keyframe's rays, then what changed on others until the deadline."""
+        if self._density is None:
+            return Update()
+        self._density.refresh(self._pool)
+        marched = remarched = converged = 0
         changed: list[int] = []
-        for number in reversed(range(len(self.keyframes))):
+        waiting = self._waiting(new)
+        while waiting:
+            number = waiting[0]
             keyframe = self.keyframes[number]
-            pending = np.flatnonzero(keyframe.waiting)
-            for part in range(0, len(pending), _SLICE):
+            rays = keyframe.rays
+            for begin in range(0, len(rays.pixels), _SLICE):
                 if number != new and perf_counter() >= deadline:
                     break
-                which = np.zeros_like(keyframe.waiting)
-                which[pending[part:part + _SLICE]] = True
-                first = int(np.count_nonzero(keyframe.rays.iterations[which] == 0))
+                chosen = stale(
+                    self._density, rays, slice(begin, begin + _SLICE), self._pool)
+                if not len(chosen):
+                    continue
+                first = int(np.count_nonzero(rays.iterations[chosen] == 0))
+                march(self._density, rays, chosen, self._pool)
                 marched += first
-                remarched += march(self.density, keyframe.rays, which, self._pool) - first
-                converged += int(np.count_nonzero(keyframe.rays.converged[which]))
-                keyframe.waiting[which] = False
+                remarched += len(chosen) - first
+                converged += int(np.count_nonzero(rays.converged[chosen]))
                 if changed[-1:] != [number]:
                     changed.append(number)
-            waiting += int(np.count_nonzero(keyframe.waiting))
+            else:
+                keyframe.checked = self._density.change
+                waiting.pop(0)
+                continue
+            break
         return Update(
-            marched=marched, remarched=remarched, converged=converged, waiting=waiting,
-            changed=tuple(changed))
+            marched=marched, remarched=remarched, converged=converged, changed=tuple(changed),
+            waiting=sum(len(self.keyframes[number].rays.pixels) for number in waiting))
+
+    def _waiting(self, new: int | None) -> list[int]:
+        """Return the keyframes that may have stale rays: the newest, then the most changed."""
+        shares = {}
+        for number, keyframe in enumerate(self.keyframes):
+            if keyframe.checked == self.density.change:
+                continue
+            if isinstance(self.density, VoxelDensity) and keyframe.blocks is not None:
+                share = self.density.share_changed(keyframe.blocks, keyframe.checked)
+                if share == 0 and number != new:
+                    keyframe.checked = self.density.change
+                    continue
+                shares[number] = share
+            else:
+                shares[number] = 0.0
+        newest = len(self.keyframes) - 1
+        return sorted(shares, key=lambda n: (n != newest, -shares[n], -n))
+
+    def _notice_aliasing(self, view: View) -> list[str]:
+        density = self.density
+        if not isinstance(density, VoxelDensity) or (
+                density.aliased_pixels <= _ALIASED * density.pixels):
+            return []
+        near = float(np.nanpercentile(view.depth, 5)) if np.isfinite(view.depth).any() else 0
+        fitting = density.finest_voxel(near, view.camera)
+        return self._once(
+            'aliasing', f'{density.aliased_pixels / density.pixels:.0%} of the pixels are too '
+            f'near for voxels of {1000 * density.voxel_size:.3g} mm: detail smaller than that is '
+            f'lost there; voxel_size:={fitting:.2g} would keep it')
+
+    def _once(self, topic: str, sentence: str) -> list[str]:
+        if topic in self._noticed:
+            return []
+        self._noticed.add(topic)
+        return [sentence]
 
 
 def warm_up(settings: Settings) -> float:
@@ -200,7 +291,9 @@ def warm_up(settings: Settings) -> float:
     began = perf_counter()
     camera = Camera(24, 16, 20.0, 20.0, 12.0, 8.0)
     depth = np.full((16, 24), 1.0, np.float32)
-    tiny = Reconstruction(settings.updated({'keyframe_translation': 0.0, 'ray_stride': 1}))
+    tiny = Reconstruction(settings.updated({
+        'keyframe_translation': 0.0, 'ray_stride': 1, 'depth_bandwidth': 0.01,
+        'voxel_size': 0.01, 'depth_min': 0.1, 'depth_max': 2.0}))
     for stamp in range(2):
         tiny.add(View(depth, camera, np.eye(4), stamp))
     tiny.finish()

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .exact_density import ExactDensity
-from .ray_march import Rays
+from .ray_march import Density, Rays
 
 ROBUST_MAXIMUM = 98.0  # percentile of the likelihoods that thresholds and colours refer to
 
@@ -35,7 +34,7 @@ class ViewMesh:
 
 
 def view_mesh(
-    density: ExactDensity,
+    density: Density,
     rays: Rays,
     width: int,
     stride: int,
@@ -55,8 +54,7 @@ def view_mesh(
     :param min_likelihood: least vertex, as a fraction of the 98th percentile
     :param min_edge_likelihood: least edge, as a fraction of the larger of its two vertices
     """
-    count = density.views.size
-    likelihood = rays.total / np.float32(max(count, 1))
+    likelihood = rays.total / np.float32(max(density.size, 1))
     kept = rays.converged
     if kept.any():
         # not in place: `converged` is made anew, but who reads this should not have to know
@@ -65,7 +63,7 @@ def view_mesh(
     v, u = np.divmod(rays.pixels, width)
     kept = kept & (v % stride == 0) & (u % stride == 0)
     likelihood = likelihood[kept]
-    vertices = rays.origin + rays.depth[kept, None].astype(np.float64) * rays.direction[kept]
+    vertices = rays.points(kept)
 
     v, u = v[kept] // stride, u[kept] // stride
     grid = np.full((v.max(initial=0) + 2, u.max(initial=0) + 2), -1, np.int32)

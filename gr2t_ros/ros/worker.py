@@ -265,6 +265,8 @@ class Worker:
         self.waiting_rays = update.waiting
         self._seconds.update(update.seconds)
         self._outputs.change(update.changed)
+        for notice in update.notices:
+            self._log.info(notice)
 
     def _publish(self) -> None:
         now = time.monotonic()

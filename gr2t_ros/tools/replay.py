@@ -164,10 +164,9 @@ class _Replay:
             return True
         if not done.integrated:
             raise InputError(self._nothing())
-        say('marching the rays that wait ...')
         begin = perf_counter()
         try:
-            self._count(self._reconstruction.finish())
+            self._finish()
         except KeyboardInterrupt:
             return True
         finally:
@@ -187,16 +186,27 @@ class _Replay:
         if update.keyframe is not None:
             done.keyframes += 1
             done.seconds['march'].append(update.seconds['march'])
-        done.refused_keyframes += update.refused_keyframe
         if not done.integrated:
             done.first_stamp_ns = view.stamp_ns
         done.last_stamp_ns = view.stamp_ns
         done.integrated += 1
 
+    def _finish(self) -> None:
+        """March what waits, a second at a time."""
+        update = self._reconstruction.finish(budget=0.0)
+        total = update.waiting
+        with Progress(total, 'rays that wait') as bar:
+            while update.waiting:
+                update = self._reconstruction.finish(budget=1.0)
+                self._count(update)
+                bar.reach(total - update.waiting)
+
     def _count(self, update: Update) -> None:
         self._done.marched += update.marched
         self._done.remarched += update.remarched
         self._done.converged += update.converged
+        for notice in update.notices:
+            say(notice)
 
     def _expected(self) -> int:
         """Return about how many frames there will be."""

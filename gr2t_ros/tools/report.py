@@ -35,7 +35,6 @@ class Run:
     read: int = 0
     integrated: int = 0
     keyframes: int = 0
-    refused_keyframes: int = 0
     dropped: Counter[str] = field(default_factory=Counter)
     explanations: dict[str, str] = field(default_factory=dict)
     marched: int = 0
@@ -117,10 +116,6 @@ def table(content: Mapping[str, Any], run: Run, results: Mapping[str, str]) -> s
         f'finish {run.finish_seconds:.1f} s',
         'mean     ' + ', '.join(f'{stage} {timing[stage]["mean"]:.1f} ms' for stage in STAGES),
         f'memory   {content["peak_memory_mb"]:.0f} MB at most']
-    if run.refused_keyframes:
-        lines.append(
-            f'keyframes reached max_keyframes ({run.settings.max_keyframes}): '
-            f'{run.refused_keyframes} later ones own no mesh')
     if run.input_damage:
         lines.append(f'damage   {run.input_damage}')
     return '\n'.join(lines)

@@ -1,0 +1,252 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+A sparse lattice: blocks of 8 x 8 x 8 voxels, found by a hash, with spline coefficients.
+
+Voxel (i, j, k) of the world lies at (i, j, k) times the voxel size; block numbers and offsets are
+whole, so no position is ever rounded. Block 0 is empty and stands for all that is not there.
+"""
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from numba import int64, njit, uint64
+import numpy as np
+from numpy.typing import NDArray
+
+from .vector import ROW
+
+Floats = NDArray[np.float32]
+
+SIDE = 8  # voxels
+VOXELS = SIDE ** 3
+COEFFICIENTS = SIDE * SIDE * ROW
+BYTES_PER_BLOCK = 4 * VOXELS + 4 * COEFFICIENTS + 8 + 27 * 4 + 2 * 4
+_BITS = 21  # of a block's number on each axis: 2 million blocks either way
+_OFFSET = 1 << (_BITS - 1)
+_MASK = (1 << _BITS) - 1
+_SELF = 13  # of the 27 neighbours (z, y, x)
+# five taps that turn samples into coefficients for vector.spline_weights: exact at constants, and
+# fitted to values and slopes of Gaussians 1 to 2 voxels wide; the exact filter never ends
+_TAP0, _TAP1, _TAP2 = np.float32(1.84459251), np.float32(-0.50952536), np.float32(0.08722910)
+
+
+class Blocks(NamedTuple):
+    """
+    The lattice's arrays, as the kernels use them.
+
+    :param size: number of blocks in use, block 0 included; the arrays may be longer
+    :param table_key: (2^k,) int64 of the hash; table_block: (2^k,) int32, 0 where free
+    :param key: (n,) int64, each block's place
+    :param value: flat float32, VOXELS a block, x fastest
+    :param coefficient: flat float32, COEFFICIENTS a block
+    :param neighbour: (n, 27) int32, 0 where there is none
+    :param touched: (n,) int32, the last change of the values; filtered: of the coefficients
+    """
+
+    size: int
+    table_key: NDArray[np.int64]
+    table_block: NDArray[np.int32]
+    key: NDArray[np.int64]
+    value: Floats
+    coefficient: Floats
+    neighbour: NDArray[np.int32]
+    touched: NDArray[np.int32]
+    filtered: NDArray[np.int32]
+
+
+def new_blocks(capacity: int = 1024) -> Blocks:
+    """Return a lattice that holds block 0 only."""
+    table = 4 * capacity
+    return Blocks(
+        1, np.zeros(table, np.int64), np.zeros(table, np.int32), np.full(capacity, -1, np.int64),
+        np.zeros(capacity * VOXELS, np.float32), np.zeros(capacity * COEFFICIENTS, np.float32),
+        np.zeros((capacity, 27), np.int32), np.zeros(capacity, np.int32),
+        np.zeros(capacity, np.int32))
+
+
+def with_keys(
+    blocks: Blocks, keys: NDArray[np.int64], change: int
+) -> tuple[Blocks, NDArray[np.int32]]:
+    """
+    Make sure that blocks exist, growing by doubling, and mark them as changed.
+
+    :param keys: (n,) int64, in any order, repeated or not
+    :param change: the number of the change, greater than all before
+    :return: the lattice and the blocks' numbers, each once, in the order of the keys
+    """
+    found = np.zeros(len(keys), np.int32)
+    size, count, done = blocks.size, 0, 0
+    while True:
+        size, count, done = _insert(blocks, size, keys, done, change, found, count)
+        if done == len(keys):
+            return blocks._replace(size=size), found[:count].copy()
+        blocks = _grown(blocks._replace(size=size))
+
+
+def _grown(blocks: Blocks) -> Blocks:
+    grown = new_blocks(2 * len(blocks.key))
+    for name in blocks._fields[3:]:
+        old = getattr(blocks, name)
+        getattr(grown, name)[:len(old)] = old
+    _rehash(grown.table_key, grown.table_block, grown.key, blocks.size)
+    return grown._replace(size=blocks.size)
+
+
+@njit(cache=True, nogil=True)
+def key_of(x: Any, y: Any, z: Any) -> np.int64:
+    """Return the key of the block with these numbers."""
+    key: np.int64 = (
+        (int64(x) + _OFFSET) | ((int64(y) + _OFFSET) << _BITS)
+        | ((int64(z) + _OFFSET) << (2 * _BITS)))
+    return key
+
+
+@njit(cache=True, nogil=True)
+def place_of(key: np.int64) -> tuple[np.int64, np.int64, np.int64]:
+    """Return the block numbers (x, y, z) of a key."""
+    return (
+        (key & _MASK) - _OFFSET, ((key >> _BITS) & _MASK) - _OFFSET,
+        ((key >> (2 * _BITS)) & _MASK) - _OFFSET)
+
+
+@njit(cache=True, nogil=True)
+def _slot(table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.int64) -> np.int64:
+    """Return where a key is in the hash, or where it would go."""
+    mask = uint64(len(table_key) - 1)
+    mixed = uint64(key) * uint64(0x9E3779B97F4A7C15)
+    slot = (mixed ^ (mixed >> uint64(32))) & mask
+    while table_block[slot] != 0 and table_key[slot] != key:
+        slot = (slot + uint64(1)) & mask
+    return int64(slot)
+
+
+@njit(cache=True, nogil=True)
+def find(blocks: Blocks, key: np.int64) -> np.int64:
+    """Return the number of the block with a key, 0 where there is none."""
+    slot = _slot(blocks.table_key, blocks.table_block, key)
+    return np.int64(blocks.table_block[slot])
+
+
+@njit(cache=True, nogil=True)
+def _rehash(
+    table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: NDArray[np.int64],
+    size: int,
+) -> None:
+    for block in range(1, size):
+        slot = _slot(table_key, table_block, key[block])
+        table_key[slot] = key[block]
+        table_block[slot] = block
+
+
+@njit(cache=True, nogil=True)
+def _insert(
+    blocks: Blocks, size: int, keys: NDArray[np.int64], done: int, change: int,
+    found: NDArray[np.int32], count: int,
+) -> tuple[int, int, int]:
+    for i in range(done, len(keys)):
+        slot = _slot(blocks.table_key, blocks.table_block, keys[i])
+        block = int64(blocks.table_block[slot])
+        if block == 0:
+            if size == len(blocks.key):
+                return size, count, i
+            block = size
+            size += 1
+            blocks.table_key[slot] = keys[i]
+            blocks.table_block[slot] = block
+            blocks.key[block] = keys[i]
+            _link(blocks, block)
+        if blocks.touched[block] != change:
+            blocks.touched[block] = change
+            found[count] = block
+            count += 1
+    return size, count, len(keys)
+
+
+@njit(cache=True, nogil=True)
+def _link(blocks: Blocks, block: int) -> None:
+    """Enter a new block in its neighbours' lists, and them in its own."""
+    x, y, z = place_of(blocks.key[block])
+    for n in range(27):
+        other = find(blocks, key_of(x + n % 3 - 1, y + n // 3 % 3 - 1, z + n // 9 - 1))
+        if other != 0:
+            blocks.neighbour[block, n] = other
+            blocks.neighbour[other, 26 - n] = block
+
+
+@njit(cache=True, nogil=True)
+def with_neighbours(
+    blocks: Blocks, changed: NDArray[np.int32], change: int
+) -> NDArray[np.int32]:
+    """Return the blocks whose coefficients depend on changed ones, each once; mark them."""
+    out = np.zeros(27 * len(changed), np.int32)
+    count = 0
+    for block in changed:
+        for n in range(27):
+            other = blocks.neighbour[block, n]
+            if other != 0 and blocks.filtered[other] != change:
+                blocks.filtered[other] = change
+                out[count] = other
+                count += 1
+    return out[:count].copy()
+
+
+@njit(cache=True, nogil=True, fastmath={'contract', 'nsz', 'reassoc'})
+def prefilter(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
+    """Compute the chosen blocks' own coefficients from the values in and about them."""
+    wide = np.zeros((12, 12, 12), np.float32)
+    along_x = np.zeros((12, 12, 8), np.float32)
+    along_y = np.zeros((12, 8, 8), np.float32)
+    for block in chosen:
+        for z in range(12):
+            nz = (z + 6) // 8
+            for y in range(12):
+                ny = (y + 6) // 8
+                line = ((z + 6) % 8 * 8 + (y + 6) % 8) * 8
+                n = 9 * nz + 3 * ny
+                left = int64(blocks.neighbour[block, n]) * VOXELS + line
+                middle = int64(blocks.neighbour[block, n + 1]) * VOXELS + line
+                right = int64(blocks.neighbour[block, n + 2]) * VOXELS + line
+                wide[z, y, 0] = blocks.value[left + 6]
+                wide[z, y, 1] = blocks.value[left + 7]
+                for x in range(8):
+                    wide[z, y, x + 2] = blocks.value[middle + x]
+                wide[z, y, 10] = blocks.value[right]
+                wide[z, y, 11] = blocks.value[right + 1]
+        for z in range(12):
+            for y in range(12):
+                for x in range(8):
+                    along_x[z, y, x] = (
+                        _TAP0 * wide[z, y, x + 2]
+                        + _TAP1 * (wide[z, y, x + 1] + wide[z, y, x + 3])
+                        + _TAP2 * (wide[z, y, x] + wide[z, y, x + 4]))
+        for z in range(12):
+            for y in range(8):
+                for x in range(8):
+                    along_y[z, y, x] = (
+                        _TAP0 * along_x[z, y + 2, x]
+                        + _TAP1 * (along_x[z, y + 1, x] + along_x[z, y + 3, x])
+                        + _TAP2 * (along_x[z, y, x] + along_x[z, y + 4, x]))
+        first = int64(block) * COEFFICIENTS
+        for z in range(8):
+            for y in range(8):
+                line = first + (z * 8 + y) * ROW
+                for x in range(8):
+                    blocks.coefficient[line + x] = (
+                        _TAP0 * along_y[z + 2, y, x]
+                        + _TAP1 * (along_y[z + 1, y, x] + along_y[z + 3, y, x])
+                        + _TAP2 * (along_y[z, y, x] + along_y[z + 4, y, x]))
+
+
+@njit(cache=True, nogil=True)
+def copy_margins(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
+    """Copy the first coefficients of the chosen blocks' rows behind the rows before them."""
+    for block in chosen:
+        before = int64(blocks.neighbour[block, _SELF - 1])
+        if before == 0:
+            continue
+        for line in range(64):
+            source = int64(block) * COEFFICIENTS + line * ROW
+            target = before * COEFFICIENTS + line * ROW + 8
+            for x in range(3):
+                blocks.coefficient[target + x] = blocks.coefficient[source + x]

@@ -1,0 +1,510 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+The density sampled on a sparse lattice: a view costs the same however many came before.
+
+A view adds its term to the voxels within its support, each once; between voxels the density is a
+cubic spline. Nothing of the view is kept, and remove() subtracts the same numbers again.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Executor
+from math import pi, sqrt
+from typing import Any, NamedTuple
+
+from numba import int64, njit, uint64
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from . import blocks as lattice
+from .blocks import Blocks, find, key_of, place_of, SIDE, VOXELS
+from .camera import Camera, project_jet
+from .vector import LANES, spline_jet, spline_weights, window_strip
+from .view import View
+from .warped import (
+    BINS,
+    CELL,
+    empty_support,
+    find_support,
+    Scale,
+    Support,
+    Warped,
+    warped,
+    Weights,
+)
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+_ROWS_OF_CELLS = 15  # a task
+_BLOCKS = 64  # a task
+_POINTS = 4096  # a task
+_FINEST = 1.5  # voxels wider than this many lateral bandwidths alias
+
+
+class Lattice(NamedTuple):
+    """
+    The sampled density, for the kernels.
+
+    :param voxel: metres
+    """
+
+    blocks: Blocks
+    voxel: float
+
+
+class Place(NamedTuple):
+    """One view's geometry, for the kernels."""
+
+    R_camera_world: Doubles
+    t_camera_world: Doubles
+    camera: Doubles
+    width: int
+    height: int
+    factor: float
+
+
+class VoxelDensity:
+    """
+    The likelihood of world points given the views added so far, on a lattice.
+
+    :param pixel_bandwidth: h1 = h2, pixels
+    :param depth_bandwidth: h3 at depth 0, metres
+    :param depth_bandwidth_quadratic: growth of h3 with the squared depth, 1/metres
+    :param voxel_size: metres; h3 is never below it
+    :param depth_max: metres; larger depths count as invalid
+    :raises InputError: if a bandwidth or the voxel size is not positive
+    """
+
+    def __init__(
+        self, pixel_bandwidth: float, depth_bandwidth: float, depth_bandwidth_quadratic: float,
+        voxel_size: float, depth_max: float,
+    ) -> None:
+        if not (pixel_bandwidth > 0 and depth_bandwidth > 0 and depth_bandwidth_quadratic >= 0):
+            raise InputError('bandwidths must be positive')
+        if not voxel_size > 0:
+            raise InputError('voxel_size must be positive')
+        self.voxel_size = voxel_size
+        self.pixel_bandwidth = pixel_bandwidth
+        # h3(z) = max(constant + quadratic z^2, floor)
+        self.bandwidth = (
+            float(depth_bandwidth), float(depth_bandwidth_quadratic), float(voxel_size))
+        self.scale = Scale.of(*self.bandwidth, depth_max)
+        self.weights = Weights.of(pixel_bandwidth)
+        self.blocks = lattice.new_blocks()
+        self.size = 0  # views
+        self.pixels = 0
+        self.aliased_pixels = 0  # nearer than the lattice can follow
+        self._depth_of_bins = self.scale.depth_of_bins()
+        self._change = 0
+        self._stale: list[NDArray[np.int32]] = []
+
+    @property
+    def state(self) -> Lattice:
+        """Return what the kernels need."""
+        return Lattice(self.blocks, self.voxel_size)
+
+    @property
+    def change(self) -> int:
+        """Return the number of the last change of the lattice."""
+        return self._change
+
+    def h3(self, depth: Doubles | Floats) -> Doubles:
+        """Return the bandwidth along the depth, metres, at depths in metres."""
+        constant, quadratic, floor = self.bandwidth
+        return np.maximum(constant + quadratic * np.asarray(depth, np.float64) ** 2, floor)
+
+    def add(self, view: View, pool: Executor | None = None) -> None:
+        """Add a view's kernels."""
+        self._accumulate(view, 1.0, pool)
+        self.size += 1
+        self.pixels += int(np.count_nonzero(np.isfinite(view.depth)))
+        nearest = self.voxel_size / self.finest_voxel(1.0, view.camera)
+        self.aliased_pixels += int(np.count_nonzero(view.depth < nearest))
+
+    def cover(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        """
+        Make sure that blocks exist, so that whoever watches them learns of every change there.
+
+        :param keys: (n,) int64, in any order, repeated or not
+        :return: the blocks' numbers, each once
+        """
+        before = self.blocks.size
+        self._change += 1
+        self.blocks, found = lattice.with_keys(self.blocks, keys, self._change)
+        if self.blocks.size > before:
+            self._stale.append(np.arange(before, self.blocks.size, dtype=np.int32))
+        return found
+
+    def finest_voxel(self, depth: float, camera: Camera) -> float:
+        """Return the widest voxel (metres) that follows the lateral kernel at a depth."""
+        return _FINEST * self.pixel_bandwidth * depth / min(camera.fx, camera.fy)
+
+    def share_changed(self, watched: NDArray[np.int32], change: int) -> float:
+        """Return the share of some blocks whose spline changed after a change."""
+        return float(np.mean(self.blocks.filtered[watched] > change)) if len(watched) else 0.0
+
+    def remove(self, view: View, pool: Executor | None = None) -> None:
+        """Subtract what add() added for the same view."""
+        self._accumulate(view, -1.0, pool)
+        self.size -= 1
+
+    def refresh(self, pool: Executor | None = None) -> None:
+        """Bring the spline up to date with the samples; before asking for anything."""
+        if not self._stale:
+            return
+        changed = np.unique(np.concatenate(self._stale))
+        self._stale.clear()
+        chosen = np.sort(lattice.with_neighbours(self.blocks, changed, self._change))
+        parts = [chosen[i:i + _BLOCKS] for i in range(0, len(chosen), _BLOCKS)]
+        _all(pool, lattice.prefilter, [(self.blocks, part) for part in parts])
+        _all(pool, lattice.copy_margins, [(self.blocks, part) for part in parts])
+
+    def likelihood(self, points: Doubles, pool: Executor | None = None) -> Doubles:
+        """
+        Evaluate the likelihood at points.
+
+        :param points: (n, 3) float64, world, metres
+        :return: (n,) float64, 1 / (px^2 m)
+        """
+        points = np.ascontiguousarray(points, np.float64)
+        directions = np.zeros((1, 3))
+        jets = np.zeros((len(points), 3))
+        _all(pool, _jets, [
+            (self.state, points[i:i + _POINTS], directions, np.zeros(1), jets[i:i + _POINTS])
+            for i in range(0, len(points), _POINTS)])
+        return jets[:, 0] / max(self.size, 1)
+
+    def along(
+        self, origins: Doubles, directions: Doubles, distances: Doubles
+    ) -> tuple[Doubles, Doubles, Doubles]:
+        """
+        Evaluate the likelihood and its derivatives along lines.
+
+        :param origins: (n, 3) float64, world, metres; directions likewise
+        :param distances: (n,) float64, in units of the directions' lengths
+        :return: f, f', f'', each (n,) float64; f in 1 / (px^2 m)
+        """
+        jets = np.zeros((len(origins), 3))
+        _jets(
+            self.state, np.ascontiguousarray(origins, np.float64),
+            np.ascontiguousarray(directions, np.float64),
+            np.ascontiguousarray(distances, np.float64), jets)
+        jets /= max(self.size, 1)
+        return jets[:, 0], jets[:, 1], jets[:, 2]
+
+    def _accumulate(self, view: View, sign: float, pool: Executor | None) -> None:
+        height, width = view.depth.shape
+        T = np.asarray(view.T_world_camera, np.float64)
+        R_world_camera = np.ascontiguousarray(T[:3, :3])
+        R_camera_world = np.ascontiguousarray(R_world_camera.T)
+        # the weights sum to 1 where the Gaussian's values sum to 2 pi h1^2
+        factor = sign / sqrt(2 * pi) / (width * height)
+        place = Place(
+            R_camera_world, -R_camera_world @ T[:3, 3], view.camera.parameters, width, height,
+            factor)
+        image = warped(view, self.scale, self.weights)
+        support = empty_support(height, width)
+        rows = [
+            (i, min(i + _ROWS_OF_CELLS, len(support.mask)))
+            for i in range(0, len(support.mask), _ROWS_OF_CELLS)]
+        _all(pool, find_support, [(image.bins, support, *part) for part in rows])
+        keys = _all(pool, _keys, [
+            (support, view.camera.rays, R_world_camera, T[:3, 3].copy(), self._depth_of_bins,
+             SIDE * self.voxel_size, *part) for part in rows])
+        self._change += 1
+        self.blocks, touched = lattice.with_keys(
+            self.blocks, np.concatenate(keys), self._change)
+        if len(touched) == 0:
+            return
+        _all(pool, _add_to_blocks, [
+            (self.state, touched[i:i + _BLOCKS], place, image, support, self.scale, self.weights)
+            for i in range(0, len(touched), _BLOCKS)])
+        self._stale.append(touched)
+
+
+def _all(
+    pool: Executor | None, task: Callable[..., Any], arguments: list[tuple[Any, ...]]
+) -> list[Any]:
+    """Run a kernel for all tuples of arguments; results in their order."""
+    if pool is None:
+        return [task(*one) for one in arguments]
+    return [done.result() for done in [pool.submit(task, *one) for one in arguments]]
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _keys(
+    support: Support, rays: Doubles, R_world_camera: Doubles, t_world_camera: Doubles,
+    depth_of_bins: Doubles, block_size: float, first: int, end: int,
+) -> NDArray[np.int64]:
+    """
+    Return the keys of the blocks that some rows of cells have support in, with repetitions.
+
+    Each cell's ray is followed through the runs of its mask, in steps that miss no block by more
+    than a corner; where a cell is wide against a block, several rays are.
+    """
+    out = np.zeros(4096, np.int64)
+    count = 0
+    last, before = int64(-1), int64(-1)
+    height, width = rays.shape[:2]
+    for j in range(first, end):
+        for i in range(support.mask.shape[1]):
+            mask = support.mask[j, i]
+            if mask == 0:
+                continue
+            base, shift = support.base[j, i], support.shift[j, i]
+            bit = 0
+            while bit < 64 and (mask >> uint64(bit)) != 0:
+                while (mask >> uint64(bit)) & uint64(1) == 0:
+                    bit += 1
+                start = bit
+                while bit < 64 and (mask >> uint64(bit)) & uint64(1) == 1:
+                    bit += 1
+                top = len(depth_of_bins) - 1
+                near = depth_of_bins[min(max(base + (start << shift), 0), top)]
+                far = depth_of_bins[min(max(base + (bit << shift), 0), top)]
+                u0, v0 = CELL * i, CELL * j
+                u1, v1 = min(u0 + CELL - 1, width - 1), min(v0 + CELL - 1, height - 1)
+                across = abs(rays[v1, u1, 0] - rays[v0, u0, 0]) + abs(
+                    rays[v1, u1, 1] - rays[v0, u0, 1])
+                # (a cell without rays at its corners holds nothing that a neighbour lacks)
+                if not across < 1e3:
+                    continue
+                lines = int(far * across / block_size) + 1
+                steps = int(2.5 * (far - near) / block_size) + 1
+                for line in range(lines * lines):
+                    p = (line % lines + 0.5) / lines
+                    q = (line // lines + 0.5) / lines
+                    a = rays[v0, u0, 0] + p * (rays[v0, u1, 0] - rays[v0, u0, 0])
+                    b = rays[v0, u0, 1] + q * (rays[v1, u0, 1] - rays[v0, u0, 1])
+                    x = R_world_camera[0, 0] * a + R_world_camera[0, 1] * b + R_world_camera[0, 2]
+                    y = R_world_camera[1, 0] * a + R_world_camera[1, 1] * b + R_world_camera[1, 2]
+                    z = R_world_camera[2, 0] * a + R_world_camera[2, 1] * b + R_world_camera[2, 2]
+                    for step in range(steps + 1):
+                        depth = near + (far - near) * step / steps
+                        key = key_of(
+                            int(np.floor((t_world_camera[0] + depth * x) / block_size)),
+                            int(np.floor((t_world_camera[1] + depth * y) / block_size)),
+                            int(np.floor((t_world_camera[2] + depth * z) / block_size)))
+                        if key != last and key != before:
+                            before, last = last, key
+                            if count == len(out):
+                                longer = np.zeros(2 * count, np.int64)
+                                longer[:count] = out
+                                out = longer
+                            out[count] = key
+                            count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True, fastmath={'contract', 'nsz', 'arcp'}, error_model='numpy')
+def _add_to_blocks(
+    state: Lattice, chosen: NDArray[np.int32], place: Place, image: Warped, support: Support,
+    scale: Scale, weights: Weights,
+) -> None:
+    """Add a view's term to the voxels of some blocks that its support holds."""
+    R, t, voxel = place.R_camera_world, place.t_camera_world, state.voxel
+    value = state.blocks.value
+    pinhole = place.camera[0] == 0
+    fx, fy = np.float32(place.camera[1]), np.float32(place.camera[2])
+    cx, cy = np.float32(place.camera[3]), np.float32(place.camera[4])
+    # offsets within a block are small: float32 holds them
+    step_x = np.float32(R[0, 0] * voxel)
+    step_y = np.float32(R[1, 0] * voxel)
+    step_z = np.float32(R[2, 0] * voxel)
+    lanes = weights.lanes
+    half = lanes // 2 - 1
+    phases = np.float32(len(weights.table) // lanes)
+    margin = np.float32(CELL)
+    right, bottom = np.float32(place.width + CELL - 1), np.float32(place.height + CELL - 1)
+    last_row, last_column = support.mask.shape[0] - 1, support.mask.shape[1] - 1
+    per_metre, deepest = np.float32(scale.per_metre), np.float32(len(scale.table) - 1)
+    constant, quadratic = np.float32(scale.constant), np.float32(scale.quadratic)
+    floor, factor = np.float32(scale.floor), np.float32(place.factor)
+    to_bin = np.float32(BINS * sqrt(32.0))
+    shifted = np.float32(1 / sqrt(32.0))
+    for block in chosen:
+        bx, by, bz = place_of(state.blocks.key[block])
+        for line in range(64):
+            px = bx * SIDE * voxel
+            py = (by * SIDE + line % SIDE) * voxel
+            pz = (bz * SIDE + line // SIDE) * voxel
+            x0 = np.float32(R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz + t[0])
+            y0 = np.float32(R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1])
+            z0 = np.float32(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2])
+            first_voxel = int64(block) * VOXELS + line * SIDE
+            for i in range(SIDE):
+                along = np.float32(i)
+                z = z0 + along * step_z
+                depth_at = z * per_metre
+                if not np.float32(0) < depth_at < deepest:
+                    continue
+                if pinhole:
+                    closeness = np.float32(1) / z
+                    u = fx * (x0 + along * step_x) * closeness + cx
+                    v = fy * (y0 + along * step_y) * closeness + cy
+                else:
+                    seen, u64, _, _, v64, _, _ = project_jet(
+                        place.camera, float(x0 + along * step_x), 0.0,
+                        float(y0 + along * step_y), 0.0, float(z), 0.0)
+                    if not seen:
+                        continue
+                    u, v = np.float32(u64), np.float32(v64)
+                # truncation is floor, as these are positive
+                u_up, v_up = u + margin, v + margin
+                if not (np.float32(0) <= u_up and np.float32(0) <= v_up
+                        and u < right and v < bottom):
+                    continue
+                u_whole, v_whole = int(u_up), int(v_up)
+                row = min(max(v_whole - CELL, 0) // CELL, last_row)
+                column = min(max(u_whole - CELL, 0) // CELL, last_column)
+                mask = support.mask[row, column]
+                if mask == uint64(0):
+                    continue
+                sample = int(depth_at)
+                at = scale.table[sample] + (depth_at - np.float32(sample)) * (
+                    scale.table[sample + 1] - scale.table[sample])
+                bit = (int(at * to_bin) - support.base[row, column]) >> support.shift[row, column]
+                if bit < 0 or bit > 63 or (mask >> uint64(bit)) & uint64(1) == 0:
+                    continue
+                h3 = constant + quadratic * z * z
+                slope = np.float32(2) * quadratic * z
+                if h3 < floor:
+                    h3, slope = floor, np.float32(0)
+                in_u = int((u_up - np.float32(u_whole)) * phases) * lanes
+                in_v = int((v_up - np.float32(v_whole)) * phases) * lanes
+                start = (
+                    (v_whole - CELL - half + image.pad) * image.stride
+                    + u_whole - CELL - half + image.pad)
+                total = np.float32(0)
+                for strip in range(0, lanes, LANES):
+                    total += window_strip(
+                        image.image, start + strip, image.stride, weights.table, in_v, lanes,
+                        weights.table, in_u + strip, at - slope * shifted)
+                value[first_voxel + i] += factor * total / h3
+
+
+class Scratch(NamedTuple):
+    """What one thread writes while it asks the lattice."""
+
+    weights: Floats
+    bases: NDArray[np.int64]
+    recent: NDArray[np.int64]  # key and number of the block last asked for
+
+
+@njit(cache=True, nogil=True)
+def new_scratch(state: Lattice) -> Scratch:
+    """Make one thread's scratch arrays."""
+    recent = np.zeros(2, np.int64)
+    recent[0] = -1
+    return Scratch(np.zeros(36, np.float32), np.zeros(4, np.int64), recent)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def jet_along(
+    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles, distance: float,
+    h3: float,
+) -> tuple[float, float, float, float]:
+    """
+    Evaluate the spline at a point of a world line; all 0 where there is no block.
+
+    :return: C f, C f', C f'', and g such that f'/g is the mean-shift step of a frontal surface
+    """
+    per_voxel = 1.0 / state.voxel
+    x = (origin[0] + distance * direction[0]) * per_voxel
+    y = (origin[1] + distance * direction[1]) * per_voxel
+    z = (origin[2] + distance * direction[2]) * per_voxel
+    i, j, k = int64(np.floor(x)), int64(np.floor(y)), int64(np.floor(z))
+    # the first of the four taps is one before
+    key = key_of((i - 1) >> 3, (j - 1) >> 3, (k - 1) >> 3)
+    if key != scratch.recent[0]:
+        block = find(state.blocks, key)
+        scratch.recent[0] = key
+        scratch.recent[1] = block
+        for n, neighbour in enumerate((13, 16, 22, 25)):  # itself, next in y, in z, in both
+            scratch.bases[n] = (
+                int64(state.blocks.neighbour[block, neighbour]) * lattice.COEFFICIENTS)
+    if scratch.recent[1] == 0:
+        return 0.0, 0.0, 0.0, 0.0
+    w = scratch.weights
+    spline_weights(w, 0, np.float32(z - k), np.float32(direction[2] * per_voxel))
+    spline_weights(w, 12, np.float32(y - j), np.float32(direction[1] * per_voxel))
+    spline_weights(w, 24, np.float32(x - i), np.float32(direction[0] * per_voxel))
+    f, f1, f2 = spline_jet(
+        state.blocks.coefficient, scratch.bases, (i - 1) & 7, (j - 1) & 7, (k - 1) & 7, w)
+    return float(f), float(f1), float(f2), float(f) / (h3 * h3)
+
+
+@njit(cache=True, nogil=True)
+def prepare(
+    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles,
+    low: float, high: float,
+) -> None:
+    """Do nothing: a lattice is asked at points."""
+
+
+@njit(cache=True, nogil=True)
+def changed_since(
+    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles,
+    low: float, high: float, change: int,
+) -> bool:
+    """Tell whether the spline on a piece of a line changed after a change."""
+    steps = int((high - low) / state.voxel) + 1
+    last = int64(-1)
+    for step in range(steps + 1):
+        key = _key_along(state, origin, direction, low + (high - low) * step / steps)
+        if key != last:
+            last = key
+            if state.blocks.filtered[find(state.blocks, key)] > change:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _key_along(state: Lattice, origin: Doubles, direction: Doubles, distance: float) -> np.int64:
+    """Return the key of the block that holds the first spline tap of a point of a line."""
+    per_voxel = 1.0 / state.voxel
+    i = int64(np.floor((origin[0] + distance * direction[0]) * per_voxel))
+    j = int64(np.floor((origin[1] + distance * direction[1]) * per_voxel))
+    k = int64(np.floor((origin[2] + distance * direction[2]) * per_voxel))
+    return key_of((i - 1) >> 3, (j - 1) >> 3, (k - 1) >> 3)
+
+
+@njit(cache=True, nogil=True)
+def keys_along(
+    state: Lattice, origin: Doubles, directions: Doubles, lows: Doubles, highs: Doubles
+) -> NDArray[np.int64]:
+    """Return the keys of the blocks that pieces of lines need, with repetitions."""
+    out = np.zeros(1024, np.int64)
+    count = 0
+    recent = np.full(4, -1, np.int64)
+    for n in range(len(directions)):
+        steps = int((highs[n] - lows[n]) / state.voxel) + 1
+        for step in range(steps + 1):
+            key = _key_along(
+                state, origin, directions[n], lows[n] + (highs[n] - lows[n]) * step / steps)
+            if key == recent[0] or key == recent[1] or key == recent[2] or key == recent[3]:
+                continue
+            recent[count % 4] = key
+            if count == len(out):
+                longer = np.zeros(2 * count, np.int64)
+                longer[:count] = out
+                out = longer
+            out[count] = key
+            count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True)
+def _jets(
+    state: Lattice, origins: Doubles, directions: Doubles, distances: Doubles, out: Doubles
+) -> None:
+    """Write the jets of lines to out (n, 3); one direction and distance may serve all."""
+    scratch = new_scratch(state)
+    for n in range(len(origins)):
+        m = min(n, len(directions) - 1)
+        f, f1, f2, _ = jet_along(
+            state, scratch, origins[n], directions[m], distances[m], 1.0)
+        out[n, 0], out[n, 1], out[n, 2] = f, f1, f2

@@ -1,0 +1,258 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Depth images in units of their own bandwidth.
+
+With t(z) = integral dz / h3(z) the residual of a depth z_i over its bandwidth is t(z_i) - t(Z) to
+first order, whatever h3(z) is: one subtraction replaces a bandwidth a pixel. The kernel's factor
+1/h3(z_i) is exp(-h3' (t_i - t)) / h3(Z), which moves t(Z) by h3'(Z) and is otherwise constant.
+Images hold t / sqrt(32), as vector.window_strip wants it.
+"""
+from __future__ import annotations
+
+from math import ceil, sqrt
+from typing import NamedTuple
+
+from numba import njit, uint64
+import numpy as np
+from numpy.typing import NDArray
+
+from .vector import LANES, window_strip
+from .view import View
+
+Floats = NDArray[np.float32]
+
+INVALID = np.float32(1e9)
+_SQRT32 = sqrt(32.0)
+_PHASES = 256  # sub-pixel positions with weights of their own
+_HALF_WIDTH = 2.6  # bandwidths; beyond, the weights are folded into the moments
+_SAMPLES = 8192  # of t(z)
+CELL = 4  # px; side of the squares that know their support
+_MARGIN = 3  # px about a cell whose depths it knows
+SUPPORT = 3.5  # bandwidths along the depth at which a kernel ends
+BINS = 2.0  # a bandwidth; resolution of the support
+_UNWARP = np.float32(BINS * _SQRT32)
+_OUTLIER = np.float32(0.2)  # less than this share of the window's best density makes an outlier
+_NEIGHBOURS = 2  # px; candidates for the robust start come from 5 x 5 pixels
+
+
+class Scale(NamedTuple):
+    """
+    t(z) / sqrt(32) at equal steps from depth 0, and what else of h3(z) the kernels need.
+
+    :param table: (n,) float32
+    :param per_metre: steps per metre
+    :param constant: h3(z) = max(constant + quadratic z^2, floor), metres
+    """
+
+    table: Floats
+    per_metre: float
+    constant: float
+    quadratic: float
+    floor: float
+
+    @classmethod
+    def of(
+        cls, constant: float, quadratic: float, floor: float, depth_max: float
+    ) -> Scale:
+        """Tabulate; depths above depth_max (metres) count as invalid."""
+        z = np.linspace(0, 1.1 * depth_max, _SAMPLES)
+        slope = 1 / np.maximum(constant + quadratic * z * z, floor)
+        steps = np.diff(z) * (slope[1:] + slope[:-1]) / 2
+        t = np.concatenate([[0.0], np.cumsum(steps)])
+        return cls(
+            (t / _SQRT32).astype(np.float32), float(1 / z[1]), constant, quadratic, floor)
+
+    def depth_of_bins(self) -> NDArray[np.float64]:
+        """Return the depth (metres) at which each support bin begins."""
+        t = self.table.astype(np.float64) * _SQRT32
+        count = int(t[-1] * BINS) + 2
+        z = np.arange(len(t)) / self.per_metre
+        return np.interp(np.arange(count) / BINS, t, z)
+
+
+class Weights(NamedTuple):
+    """
+    The lateral kernel at sub-pixel positions.
+
+    :param table: flat (phases, lanes) float32; each row sums to 1 and has the mean and the
+        variance of the Gaussian, and nearly its fourth moment, though it ends after lanes pixels
+    :param lanes: pixels on each axis
+    """
+
+    table: Floats
+    lanes: int
+
+    @classmethod
+    def of(cls, bandwidth: float) -> Weights:
+        """Return the weights of a bandwidth in pixels."""
+        lanes = LANES * ceil(2 * _HALF_WIDTH * bandwidth / LANES)
+        phase = (np.arange(_PHASES) + 0.5) / _PHASES
+        d = np.arange(lanes) - (lanes // 2 - 1) - phase[:, None]
+        powers = d[:, None, :] ** np.arange(9)[:, None]
+        gauss = np.exp(-0.5 * (d / bandwidth) ** 2)
+        moments = np.einsum('pkl,pl->pk', powers, gauss)
+        wanted = np.array([1.0, 0.0, bandwidth ** 2, 0.0, 3 * bandwidth ** 4])
+        table = np.zeros_like(d)
+        # with the fourth moment the error at steep slopes has the other sign: half of each
+        for count in (3, 5):
+            order = np.arange(count)
+            factors = np.linalg.solve(
+                moments[:, np.add.outer(order, order)],
+                np.tile(wanted[:count], (_PHASES, 1))[..., None])[..., 0]
+            table += 0.5 * gauss * np.einsum('pkl,pk->pl', powers[:, :count], factors)
+        return cls(table.astype(np.float32).ravel(), lanes)
+
+
+class Warped(NamedTuple):
+    """
+    A depth image ready for window_strip.
+
+    :param image: flat padded image of t / sqrt(32), INVALID where there is none
+    :param stride: of its rows
+    :param pad: pixels before the first, on both axes
+    :param bins: (h, w) int32, the support bin of each pixel, -1 where invalid
+    """
+
+    image: Floats
+    stride: int
+    pad: int
+    bins: NDArray[np.int32]
+
+
+class Support(NamedTuple):
+    """
+    Where a view's kernels are, by cells of CELL x CELL pixels.
+
+    Bit k of a cell says that pixels about it have kernels in the bins base + (k << shift) on.
+    """
+
+    base: NDArray[np.int32]
+    shift: NDArray[np.int32]
+    mask: NDArray[np.uint64]
+
+
+def warped(view: View, scale: Scale, weights: Weights) -> Warped:
+    """Return a view's depth image in units of its bandwidth."""
+    height, width = view.depth.shape
+    pad = weights.lanes + _MARGIN + CELL
+    image = np.full((height + 2 * pad, width + 2 * pad), INVALID)
+    bins = np.full((height, width), -1, np.int32)
+    # without a ray a pixel has no place in space
+    depth = view.depth
+    if np.isnan(view.camera.rays).any():
+        depth = np.where(np.isnan(view.camera.rays[..., 0]), np.float32(np.nan), depth)
+    _warp(np.ascontiguousarray(depth), scale, pad, image, bins)
+    return Warped(image.ravel(), image.shape[1], pad, bins)
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _warp(
+    depth: Floats, scale: Scale, pad: int, image: Floats, bins: NDArray[np.int32]
+) -> None:
+    last = np.float32(len(scale.table) - 1)
+    per_metre = np.float32(scale.per_metre)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            at = depth[v, u] * per_metre
+            if np.float32(0) < at < last:
+                i = int(at)
+                t = scale.table[i] + (at - np.float32(i)) * (scale.table[i + 1] - scale.table[i])
+                image[v + pad, u + pad] = t
+                bins[v, u] = int(t * _UNWARP)
+
+
+def empty_support(height: int, width: int) -> Support:
+    """Return the support of an image before find_support fills it in."""
+    shape = (-(-height // CELL), -(-width // CELL))
+    return Support(
+        np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, np.uint64))
+
+
+@njit(cache=True, nogil=True)
+def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int) -> None:
+    """Fill in the support of rows of cells, from first to end."""
+    height, width = bins.shape
+    reach = int(np.ceil(SUPPORT * BINS))
+    for j in range(first, end):
+        top, bottom = max(CELL * j - _MARGIN, 0), min(CELL * (j + 1) + _MARGIN, height)
+        for i in range(support.mask.shape[1]):
+            left, right = max(CELL * i - _MARGIN, 0), min(CELL * (i + 1) + _MARGIN, width)
+            low, high = 2 ** 30, -1
+            for v in range(top, bottom):
+                for u in range(left, right):
+                    b = bins[v, u]
+                    if b >= 0:
+                        low = min(low, b)
+                        high = max(high, b)
+            support.mask[j, i] = uint64(0)
+            if high < 0:
+                continue
+            base = low - reach
+            span = high + reach - base
+            shift = 0
+            while (span >> shift) > 62:
+                shift += 1
+            mask = uint64(0)
+            if high - low <= 2 * reach:
+                # one surface: no gap that a bin would show
+                mask = (uint64(2) << uint64(span >> shift)) - uint64(1)
+            else:
+                for v in range(top, bottom):
+                    for u in range(left, right):
+                        b = bins[v, u]
+                        if b >= 0:
+                            a = uint64((b - reach - base) >> shift)
+                            c = uint64((b + reach - base) >> shift)
+                            mask |= ((uint64(2) << (c - a)) - uint64(1)) << a
+            support.base[j, i] = base
+            support.shift[j, i] = shift
+            support.mask[j, i] = mask
+
+
+@njit(cache=True, nogil=True)
+def robust_starts(
+    warped_image: Warped, weights: Weights, width: int, depth: Floats,
+    pixels: NDArray[np.int32], starts: Floats,
+) -> None:
+    """
+    Replace observed depths that their own image contradicts.
+
+    The candidates are the depths of the 5 x 5 neighbours; each is weighed by the view's own
+    density on the ray there, without the kernel of the pixel that proposes it.
+
+    :param depth: (h w,) float32, metres
+    :param pixels: (n,) flat pixel indices
+    :param starts: (n,) float32, metres: the observed depths; outliers are replaced
+    """
+    image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
+    lanes = weights.lanes
+    half = lanes // 2 - 1
+    for n in range(len(pixels)):
+        v, u = divmod(pixels[n], width)
+        centre = (v + pad) * stride + u + pad
+        first = centre - half * stride - half
+        observed = np.float32(0)
+        for strip in range(0, lanes, LANES):
+            observed += window_strip(
+                image, first + strip, stride, weights.table, 0, lanes, weights.table, strip,
+                image[centre])
+        observed -= weights.table[half] * weights.table[half]
+        if observed >= _OUTLIER:
+            continue  # no depth can have more than 1
+        best, best_pixel = observed, pixels[n]
+        for row in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
+            for column in range(-_NEIGHBOURS, _NEIGHBOURS + 1):
+                at = centre + row * stride + column
+                if image[at] == INVALID or at == centre:
+                    continue
+                share = np.float32(0)
+                for strip in range(0, lanes, LANES):
+                    share += window_strip(
+                        image, first + strip, stride, weights.table, 0, lanes, weights.table,
+                        strip, image[at])
+                share -= weights.table[half + row] * weights.table[half + column]
+                if share > best:
+                    best, best_pixel = share, pixels[n] + row * width + column
+        if observed < _OUTLIER * best:
+            starts[n] = depth[best_pixel]
