@@ -97,7 +97,8 @@ class NodeProcess:
                 f'snapshot_directory:={self.snapshots}', *arguments, stdout=log,
                 stderr=subprocess.STDOUT)
         if ready:
-            self.wait_for('subscribed to')
+            # it may have to compile its kernels, beside other work
+            self.wait_for('subscribed to', 5 * LIMIT)
 
     @property
     def log(self) -> str:

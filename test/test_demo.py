@@ -45,7 +45,8 @@ def test_an_interrupt_ends_all_processes(tmp_path: Path) -> None:
         process = Isolation().run(
             'gr2t_ros.tools.demo', '-o', tmp_path, stdout=output, stderr=subprocess.STDOUT)
     try:
-        wait_until(lambda: '[3/6]' in (tmp_path / 'output').read_text(), 'the player')
+        wait_until(lambda: '[3/6]' in (tmp_path / 'output').read_text(), 'the player',
+                   5 * LIMIT)
         process.send_signal(signal.SIGINT)
         assert process.wait(LIMIT) == 130
     finally:

@@ -164,14 +164,17 @@ def test_wheel_holds_all(tmp_path: Path) -> None:
     assert 'gr2t_node = gr2t_ros.ros.node:main' in (info / 'entry_points.txt').read_text()
 
 
-def test_colcon_builds_it(tmp_path: Path) -> None:
+def test_colcon_builds_and_tests_it(tmp_path: Path) -> None:
     beside_python = Path(sys.executable).parent
     path = f'{beside_python}{os.pathsep}{os.environ["PATH"]}'
     colcon = shutil.which('colcon', path=path)
     if colcon is None:
         pytest.skip('colcon is not installed')
-    copy_of_checkout(tmp_path / 'src')
-    run([colcon, 'build'], tmp_path, PATH=path, COLCON_HOME=str(tmp_path / 'home'))
+    tests = copy_of_checkout(tmp_path / 'src') / 'test'
+    tests.mkdir()
+    shutil.copy(ROOT / 'test' / 'test_share.py', tests)
+    here = {'PATH': path, 'COLCON_HOME': str(tmp_path / 'home')}
+    run([colcon, 'build'], tmp_path, **here)
     prefix = tmp_path / 'install' / 'gr2t_ros'
     assert_share_is_complete(prefix / 'share' / 'gr2t_ros')
     assert (prefix / 'share/ament_index/resource_index/packages/gr2t_ros').is_file()
@@ -179,7 +182,11 @@ def test_colcon_builds_it(tmp_path: Path) -> None:
     assert os.access(commands / 'gr2t_node', os.X_OK)
     # The shell that sources it runs the installed copy, with the installed presets.
     shell = f'. {tmp_path}/install/local_setup.sh && '
-    assert 'replay' in run(['sh', '-c', f'{shell}{commands / "gr2t"} --help'], tmp_path, PATH=path)
+    assert 'replay' in run(['sh', '-c', f'{shell}{commands / "gr2t"} --help'], tmp_path, **here)
     found = run(['sh', '-c', f'{shell}{sys.executable} -c "from gr2t_ros import share; '
-                             'print(share.share_directory())"'], tmp_path, PATH=path)
+                             'print(share.share_directory())"'], tmp_path, **here)
     assert Path(found.strip().splitlines()[-1]) == prefix / 'share' / 'gr2t_ros'
+
+    run([colcon, 'test'], tmp_path, **here)
+    assert 'Summary: 4 tests, 0 errors, 0 failures' in run(
+        [colcon, 'test-result'], tmp_path, **here)

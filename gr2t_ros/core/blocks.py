@@ -26,7 +26,7 @@ _BITS = 21  # of a block's number on each axis: 2 million blocks either way
 _OFFSET = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
 _SELF = 13  # of the 27 neighbours (z, y, x)
-# five taps that turn samples into coefficients for vector.spline_weights: exact at constants, and
+# five taps that turn samples into coefficients for vector.spline_jet: exact at constants, and
 # fitted to values and slopes of Gaussians 1 to 2 voxels wide; the exact filter never ends
 _TAP0, _TAP1, _TAP2 = np.float32(1.84459251), np.float32(-0.50952536), np.float32(0.08722910)
 
@@ -122,10 +122,11 @@ def _slot(table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.
 
 
 @njit(cache=True, nogil=True)
-def find(blocks: Blocks, key: np.int64) -> np.int64:
+def find(
+    table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.int64
+) -> np.int64:
     """Return the number of the block with a key, 0 where there is none."""
-    slot = _slot(blocks.table_key, blocks.table_block, key)
-    return np.int64(blocks.table_block[slot])
+    return np.int64(table_block[_slot(table_key, table_block, key)])
 
 
 @njit(cache=True, nogil=True)
@@ -168,7 +169,8 @@ def _link(blocks: Blocks, block: int) -> None:
     """Enter a new block in its neighbours' lists, and them in its own."""
     x, y, z = place_of(blocks.key[block])
     for n in range(27):
-        other = find(blocks, key_of(x + n % 3 - 1, y + n // 3 % 3 - 1, z + n // 9 - 1))
+        key = key_of(x + n % 3 - 1, y + n // 3 % 3 - 1, z + n // 9 - 1)
+        other = find(blocks.table_key, blocks.table_block, key)
         if other != 0:
             blocks.neighbour[block, n] = other
             blocks.neighbour[other, 26 - n] = block

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import project_jet
+from .climb import aim, climb, h3_at, INTERVAL, MAX_ITERATIONS, set_out, Status
 from .kernel import (
     axis_weights,
     Floats,
@@ -296,7 +297,7 @@ def _supported(
 
 
 @njit(cache=True, nogil=True)
-def prepare(
+def _prepare(
     state: ViewSum, scratch: Scratch, origin: Doubles, direction: Doubles,
     low: float, high: float,
 ) -> None:
@@ -310,9 +311,8 @@ def prepare(
 
 
 @njit(cache=True, nogil=True)
-def changed_since(
-    state: ViewSum, scratch: Scratch, origin: Doubles, direction: Doubles,
-    low: float, high: float, change: int,
+def _changed_since(
+    state: ViewSum, origin: Doubles, direction: Doubles, low: float, high: float, change: int
 ) -> bool:
     """Tell whether a view added after a change may have a share on a piece of a line."""
     for c in range(change, state.views.size):
@@ -428,3 +428,48 @@ def _jets(
             state, scratch, origins[i], directions[i], distances[i], 1.0)
         out[i, 0], out[i, 1], out[i, 2] = f, f1, f2
     return out
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def march_rays(
+    state: ViewSum, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
+    pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,
+    depths: Floats, totals: Floats, statuses: NDArray[np.uint8], counts: NDArray[np.uint8],
+) -> None:
+    """Climb from the starts of chosen rays; see ray_march.Rays for the arrays."""
+    scratch = new_scratch(state)
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in chosen:
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        h3 = h3_at(bandwidth, start)
+        reach = INTERVAL * h3
+        _prepare(state, scratch, origin, direction, start - reach, start + reach)
+        ray = set_out(start)
+        count = 0
+        while ray.status == 0 and count < MAX_ITERATIONS:
+            f, f1, f2, g = jet_along(state, scratch, origin, direction, ray.target, h3)
+            ray = climb(ray, start, h3, f, f1, f2, g)
+            count += 1
+        depths[i] = ray.beta
+        totals[i] = ray.value
+        statuses[i] = ray.status if ray.status != 0 else Status.ITERATION_LIMIT
+        counts[i] = count
+
+
+@njit(cache=True, nogil=True)
+def changed_rays(
+    state: ViewSum, bandwidth: tuple[float, float, float], pixels: NDArray[np.int32],
+    table: Doubles, T_world_camera: Doubles, starts: Floats, marched: NDArray[np.int32],
+    out: NDArray[np.bool_],
+) -> None:
+    """Tell of each ray whether the density in its interval changed since it was marched."""
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in range(len(pixels)):
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        reach = INTERVAL * h3_at(bandwidth, start)
+        out[i] = marched[i] < 0 or _changed_since(
+            state, origin, direction, start - reach, start + reach, marched[i])

@@ -4,24 +4,20 @@
 Maxima of the density along the rays of a view.
 
 A ray starts at its pixel's observed depth, or where that is an outlier at a neighbour's, and
-climbs by Newton-Raphson on f (Grogan & Dahyot 2014). Newton is safe only where f'' < 0 and f does
-not fall; elsewhere the ray takes the mean-shift step, which always climbs. It stays within 4 h3 of
-its start.
+climbs within 4 h3 of its start, as climb.py says.
 """
 from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import Any
+from types import ModuleType
 
-from numba import njit
-from numba.extending import overload
 import numpy as np
 from numpy.typing import NDArray
 
 from . import exact_density, voxel_density
+from .climb import INTERVAL, Status
 from .exact_density import ExactDensity
 from .view import View
 from .voxel_density import keys_along, VoxelDensity
@@ -31,20 +27,7 @@ Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Density = ExactDensity | VoxelDensity
 
-INTERVAL = 4.0  # h3; the search goes this far from the start
-MAX_ITERATIONS = 50
-_TOLERANCE = 0.02  # h3; a Newton step this short is the last, and good to its cube
 _CHUNK = 2048  # rays a task
-
-
-class Status(IntEnum):
-    """How a ray ended."""
-
-    NOT_MARCHED = 0
-    CONVERGED = 1
-    LEFT_INTERVAL = 2
-    NO_SUPPORT = 3
-    ITERATION_LIMIT = 4
 
 
 @dataclass(eq=False)
@@ -133,8 +116,9 @@ def march(
     :param which: (n,) int64, indices of rays
     :param pool: where to do it; None: in this thread
     """
+    kernels = _kernels(density)
     _over_chunks(
-        pool, len(which), lambda part: _march(
+        pool, len(which), lambda part: kernels.march_rays(
             density.state, density.bandwidth, which[part], rays.pixels, rays.table,
             rays.T_world_camera, rays.start, rays.depth, rays.total, rays.status,
             rays.iterations))
@@ -153,8 +137,9 @@ def stale(
     marched = rays.marched[part]
     changed = np.zeros(len(marched), np.bool_)
     pixels, starts = rays.pixels[part], rays.start[part]
+    kernels = _kernels(density)
     _over_chunks(
-        pool, len(marched), lambda chunk: _changed(
+        pool, len(marched), lambda chunk: kernels.changed_rays(
             density.state, density.bandwidth, pixels[chunk], rays.table, rays.T_world_camera,
             starts[chunk], marched[chunk], changed[chunk]))
     rays.marched[part] = np.where(changed, marched, density.change)
@@ -175,6 +160,11 @@ def watched_blocks(
     return density.cover(np.concatenate(keys) if keys else np.zeros(0, np.int64))
 
 
+def _kernels(density: Density) -> ModuleType:
+    """Return the module whose march_rays and changed_rays take the density's state."""
+    return voxel_density if isinstance(density, VoxelDensity) else exact_density
+
+
 def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None]) -> None:
     """Run task(slice) over all chunks; each ray is its own, so any split gives the same bits."""
     parts = [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
@@ -184,144 +174,3 @@ def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None
     else:
         for done in [pool.submit(task, part) for part in parts]:
             done.result()
-
-
-# What the kernels below ask of a density; numba chooses by the type of its state.
-
-
-def _new_scratch(state: Any) -> Any:
-    """Make one thread's scratch arrays."""
-    raise NotImplementedError
-
-
-def _prepare(state: Any, scratch: Any, origin: Any, direction: Any, low: Any, high: Any) -> Any:
-    """Get ready for a piece of a line."""
-    raise NotImplementedError
-
-
-def _jet(state: Any, scratch: Any, origin: Any, direction: Any, distance: Any, h3: Any) -> Any:
-    """Return C f, C f', C f'', and g such that f'/g is the mean-shift step."""
-    raise NotImplementedError
-
-
-def _changed_since(
-    state: Any, scratch: Any, origin: Any, direction: Any, low: Any, high: Any, change: Any
-) -> Any:
-    """Tell whether the density on a piece of a line changed after a change."""
-    raise NotImplementedError
-
-
-def _kind(state: Any) -> Any:
-    """Return the module that implements the density of a state's numba type."""
-    return {
-        exact_density.ViewSum: exact_density, voxel_density.Lattice: voxel_density,
-    }[state.instance_class]
-
-
-@overload(_new_scratch)
-def _(state):  # type: ignore[no-untyped-def]
-    of_kind = _kind(state).new_scratch
-    return lambda state: of_kind(state)
-
-
-@overload(_prepare)
-def _(state, scratch, origin, direction, low, high):  # type: ignore[no-untyped-def]
-    of_kind = _kind(state).prepare
-    return lambda state, scratch, origin, direction, low, high: of_kind(
-        state, scratch, origin, direction, low, high)
-
-
-@overload(_jet)
-def _(state, scratch, origin, direction, distance, h3):  # type: ignore[no-untyped-def]
-    of_kind = _kind(state).jet_along
-    return lambda state, scratch, origin, direction, distance, h3: of_kind(
-        state, scratch, origin, direction, distance, h3)
-
-
-@overload(_changed_since)
-def _(state, scratch, origin, direction, low, high, change):  # type: ignore[no-untyped-def]
-    of_kind = _kind(state).changed_since
-    return lambda state, scratch, origin, direction, low, high, change: of_kind(
-        state, scratch, origin, direction, low, high, change)
-
-
-@njit(cache=True, nogil=True)
-def _h3(bandwidth: tuple[float, float, float], depth: float) -> float:
-    return max(bandwidth[0] + bandwidth[1] * depth * depth, bandwidth[2])
-
-
-@njit(cache=True, nogil=True)
-def _aim(table: Doubles, T_world_camera: Doubles, pixel: int, direction: Doubles) -> None:
-    """Write the world direction of a pixel's ray."""
-    v, u = divmod(pixel, table.shape[1])
-    a, b = table[v, u, 0], table[v, u, 1]
-    for n in range(3):
-        direction[n] = (
-            a * T_world_camera[n, 0] + b * T_world_camera[n, 1] + T_world_camera[n, 2])
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def _march(
-    state: Any, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
-    pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,
-    depths: Floats, totals: Floats, statuses: NDArray[np.uint8], counts: NDArray[np.uint8],
-) -> None:
-    scratch = _new_scratch(state)
-    origin = T_world_camera[:3, 3].copy()
-    direction = np.zeros(3)
-    for i in chosen:
-        _aim(table, T_world_camera, pixels[i], direction)
-        start = float(starts[i])
-        h3 = _h3(bandwidth, start)
-        low, high = start - INTERVAL * h3, start + INTERVAL * h3
-        _prepare(state, scratch, origin, direction, low, high)
-        beta = start
-        f, f1, f2, g = _jet(state, scratch, origin, direction, beta, h3)
-        count = 1
-        status = Status.ITERATION_LIMIT if f > 0 else Status.NO_SUPPORT
-        stretch = 0.5  # mean-shift steps in a row grow: between two humps they are tiny
-        while f > 0 and count < MAX_ITERATIONS:
-            newton = f2 < 0
-            stretch = 0.5 if newton else 2.0 * stretch
-            step = -f1 / f2 if newton else stretch * f1 / g
-            if newton and abs(step) <= _TOLERANCE * h3 and low <= beta + step <= high:
-                beta += step
-                f += 0.5 * f1 * step
-                status = Status.CONVERGED
-                break
-            step = min(max(step, -h3), h3)
-            target = min(max(beta + step, low), high)
-            if target == beta:
-                status = Status.LEFT_INTERVAL
-                break
-            t, t1, t2, tg = _jet(state, scratch, origin, direction, target, h3)
-            count += 1
-            if t < f:
-                # too far: the plain mean-shift step climbs
-                stretch = 0.5
-                step = min(max(f1 / g, -h3), h3)
-                target = min(max(beta + step, low), high)
-                t, t1, t2, tg = _jet(state, scratch, origin, direction, target, h3)
-                count += 1
-            beta, f, f1, f2, g = target, t, t1, t2, tg
-        depths[i] = beta
-        totals[i] = f
-        statuses[i] = status
-        counts[i] = count
-
-
-@njit(cache=True, nogil=True)
-def _changed(
-    state: Any, bandwidth: tuple[float, float, float], pixels: NDArray[np.int32],
-    table: Doubles, T_world_camera: Doubles, starts: Floats, marched: NDArray[np.int32],
-    out: NDArray[np.bool_],
-) -> None:
-    scratch = _new_scratch(state)
-    origin = T_world_camera[:3, 3].copy()
-    direction = np.zeros(3)
-    for i in range(len(pixels)):
-        _aim(table, T_world_camera, pixels[i], direction)
-        start = float(starts[i])
-        reach = INTERVAL * _h3(bandwidth, start)
-        out[i] = marched[i] < 0 or _changed_since(
-            state, scratch, origin, direction, start - reach, start + reach, marched[i])

@@ -13,13 +13,11 @@ from collections.abc import Callable
 from typing import Any
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 import numpy as np
 from numpy.typing import NDArray
-
-Floats = NDArray[np.float32]
 
 LANES = 8
 ROW = 12  # coefficients stored for a row of eight voxels: three of the next block, one spare
@@ -43,11 +41,18 @@ class _Vectors:
     def constant(self, value: float) -> Any:
         return ir.Constant(self.type, [ir.Constant(_FLOAT, float(np.float32(value)))] * self.lanes)
 
+    def constants(self, values: NDArray[np.float64]) -> Any:
+        return ir.Constant(self.type, [ir.Constant(_FLOAT, float(np.float32(x))) for x in values])
+
     def splat(self, scalar: Any) -> Any:
         undefined = ir.Constant(self.type, ir.Undefined)
-        one = self.builder.insert_element(undefined, scalar, ir.Constant(_I32, 0))
-        zeros = ir.Constant(ir.VectorType(_I32, self.lanes), [0] * self.lanes)
-        return self.builder.shuffle_vector(one, undefined, zeros)
+        return self.spread(
+            self.builder.insert_element(undefined, scalar, ir.Constant(_I32, 0)), 0)
+
+    def spread(self, vector: Any, lane: int) -> Any:
+        undefined = ir.Constant(self.type, ir.Undefined)
+        lanes = ir.Constant(ir.VectorType(_I32, self.lanes), [lane] * self.lanes)
+        return self.builder.shuffle_vector(vector, undefined, lanes)
 
     def load(self, pointer: Any, index: Any) -> Any:
         place = self.builder.gep(pointer, [index])
@@ -145,9 +150,18 @@ def _window_strip(  # type: ignore[no-untyped-def]
     return signature, generate
 
 
+# The spline's four taps as polynomials of the fraction: rows are powers, columns taps. The kernel
+# is the cubic B-spline plus 1/42 of its second derivative (O-MOMS of degree 3: Blu, Thevenaz,
+# Unser 2001): no four taps have less error. It is continuous; its derivative has small steps at
+# the voxels.
+SPLINE = (
+    np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
+    + np.array([[1, -2, 1, 0], [-1, 3, -3, 1], [0, 0, 0, 0], [0, 0, 0, 0]]) / 42)
+
+
 @intrinsic
 def _spline_jet(  # type: ignore[no-untyped-def]
-    typing_context, coefficients, bases, x, y, z, weights
+    typing_context, coefficients, bases, x, y, z, at_x, at_y, at_z, along_x, along_y, along_z
 ):
     """
     Contract 4 x 4 x 4 spline coefficients to a value and its two derivatives along a ray.
@@ -155,22 +169,35 @@ def _spline_jet(  # type: ignore[no-untyped-def]
     :param coefficients: flat float32; a block is 8 (z) x 8 (y) x ROW (x)
     :param bases: (4,) int64: where the block of the first tap begins, the next in y, in z, in both
     :param x: the first tap within its block, 0 to 7; likewise y, z
-    :param weights: (36,) float32 from spline_weights: z, then y, then x
+    :param at_x: fraction of the way from the second tap to the third, float32
+    :param along_x: the ray's component, voxels per unit, float32
     """
     signature = _THREE_FLOATS(
-        coefficients, bases, types.int64, types.int64, types.int64, weights)
+        coefficients, bases, types.int64, types.int64, types.int64, *[types.float32] * 6)
 
     def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         pointer = _pointers(context, builder, signature, arguments)
-        coefficients, bases, weights = pointer(0), pointer(1), pointer(5)
+        coefficients, bases = pointer(0), pointer(1)
         x, y, z = arguments[2:5]
         v = _Vectors(builder, 4)
 
         def whole(value: int) -> Any:
             return ir.Constant(_I64, value)
 
-        def splat_weight(number: int) -> Any:
-            return v.splat_of(weights, whole(number))
+        def weights(at: Any, along: Any) -> list[Any]:
+            """Return the four taps' weights, their first and their second derivatives."""
+            at, along = v.splat(at), v.splat(along)
+            orders = []
+            powers = SPLINE
+            for order in range(3):
+                total = v.constants(powers[-1])
+                for row in powers[-2::-1]:
+                    total = v.multiply_add(total, at, v.constants(row))
+                for _ in range(order):
+                    total = builder.fmul(total, along)
+                orders.append(total)
+                powers = powers[1:] * np.arange(1, len(powers))[:, None]
+            return orders
 
         def place(first: Any, tap: int, step: int, bit: int) -> tuple[Any, Any]:
             """Return a tap's offset within its block, and its part of the block's number."""
@@ -180,7 +207,9 @@ def _spline_jet(  # type: ignore[no-untyped-def]
 
         in_y = [place(y, tap, ROW, 0) for tap in range(4)]
         in_z = [place(z, tap, 8 * ROW, 1) for tap in range(4)]
-        of_z = [[splat_weight(4 * order + tap) for tap in range(4)] for order in range(3)]
+        of_x, of_y, of_z = (
+            weights(arguments[5 + axis], arguments[8 + axis]) for axis in range(3))
+        each_z = [[v.spread(of_z[order], tap) for tap in range(4)] for order in range(3)]
         # jets (value, first, second derivative) multiply like polynomials: z, then y, then x
         total = [v.constant(0)] * 3
         for tap_y, (offset_y, block_y) in enumerate(in_y):
@@ -191,15 +220,15 @@ def _spline_jet(  # type: ignore[no-untyped-def]
                     coefficients,
                     builder.add(builder.add(base, x), builder.add(offset_z, offset_y)))
                 line = [
-                    v.multiply_add(row, of_z[order][tap_z], line[order]) for order in range(3)]
-            w0, w1, w2 = (splat_weight(12 + 4 * order + tap_y) for order in range(3))
+                    v.multiply_add(row, each_z[order][tap_z], line[order]) for order in range(3)]
+            w0, w1, w2 = (v.spread(of_y[order], tap_y) for order in range(3))
             twice_w1 = builder.fadd(w1, w1)
             total = [
                 v.multiply_add(w0, line[0], total[0]),
                 v.multiply_add(w1, line[0], v.multiply_add(w0, line[1], total[1])),
                 v.multiply_add(w2, line[0], v.multiply_add(
                     twice_w1, line[1], v.multiply_add(w0, line[2], total[2])))]
-        w0, w1, w2 = (v.load(weights, whole(24 + 4 * order)) for order in range(3))
+        w0, w1, w2 = of_x
         twice_w1 = builder.fadd(w1, w1)
         jet = [
             builder.fmul(w0, total[0]),
@@ -214,37 +243,3 @@ def _spline_jet(  # type: ignore[no-untyped-def]
 # for type checkers: callers do not pass the first argument
 window_strip: Callable[..., np.float32] = _window_strip
 spline_jet: Callable[..., tuple[np.float32, np.float32, np.float32]] = _spline_jet
-
-
-@njit(inline='always')
-def spline_weights(weights: Floats, first: int, at: np.float32, velocity: np.float32) -> None:
-    """
-    Write the weights of one axis' four taps and their two derivatives along a ray.
-
-    The kernel is the cubic B-spline plus 1/42 of its second derivative (the O-MOMS of degree 3,
-    Blu, Thevenaz & Unser 2001), which has the least error a cubic can have with four taps. It is
-    continuous; its derivative has small steps at the voxels.
-
-    :param weights: (36,); 12 of them are written, from first
-    :param at: fraction of the way from the second tap to the third
-    :param velocity: the ray's component along this axis, voxels per unit
-    """
-    one, two, three, four = np.float32(1), np.float32(2), np.float32(3), np.float32(4)
-    sixth, part = np.float32(1 / 6), np.float32(1 / 42)
-    rest = one - at
-    bend1, bend2 = three * at - two, one - three * at
-    weights[first] = rest * rest * rest * sixth + part * rest
-    weights[first + 1] = (four + at * at * (three * at - two * three)) * sixth + part * bend1
-    weights[first + 2] = (four + rest * rest * (three * rest - two * three)) * sixth + part * bend2
-    weights[first + 3] = at * at * at * sixth + part * at
-    half = np.float32(0.5) * velocity
-    jump = part * velocity
-    weights[first + 4] = -rest * rest * half - jump
-    weights[first + 5] = at * (three * at - four) * half + three * jump
-    weights[first + 6] = -rest * (three * rest - four) * half - three * jump
-    weights[first + 7] = at * at * half + jump
-    square = velocity * velocity
-    weights[first + 8] = rest * square
-    weights[first + 9] = bend1 * square
-    weights[first + 10] = bend2 * square
-    weights[first + 11] = at * square

@@ -21,7 +21,8 @@ from ..errors import InputError
 from . import blocks as lattice
 from .blocks import Blocks, find, key_of, place_of, SIDE, VOXELS
 from .camera import Camera, project_jet
-from .vector import LANES, spline_jet, spline_weights, window_strip
+from .climb import aim, climb, h3_at, INTERVAL, MAX_ITERATIONS, set_out, Status
+from .vector import LANES, spline_jet, window_strip
 from .view import View
 from .warped import (
     BINS,
@@ -306,7 +307,11 @@ def _add_to_blocks(
 ) -> None:
     """Add a view's term to the voxels of some blocks that its support holds."""
     R, t, voxel = place.R_camera_world, place.t_camera_world, state.voxel
-    value = state.blocks.value
+    # taken out once: in the inner loop each would be counted as in use
+    value, key = state.blocks.value, state.blocks.key
+    pixels, stride = image.image, image.stride
+    table, weight = scale.table, weights.table
+    base, shift, masks = support.base, support.shift, support.mask
     pinhole = place.camera[0] == 0
     fx, fy = np.float32(place.camera[1]), np.float32(place.camera[2])
     cx, cy = np.float32(place.camera[3]), np.float32(place.camera[4])
@@ -315,18 +320,19 @@ def _add_to_blocks(
     step_y = np.float32(R[1, 0] * voxel)
     step_z = np.float32(R[2, 0] * voxel)
     lanes = weights.lanes
-    half = lanes // 2 - 1
-    phases = np.float32(len(weights.table) // lanes)
+    # from a point's pixel, counted from CELL before the image, to its window's first
+    offset = image.pad - CELL - (lanes // 2 - 1)
+    phases = np.float32(len(weight) // lanes)
     margin = np.float32(CELL)
     right, bottom = np.float32(place.width + CELL - 1), np.float32(place.height + CELL - 1)
-    last_row, last_column = support.mask.shape[0] - 1, support.mask.shape[1] - 1
-    per_metre, deepest = np.float32(scale.per_metre), np.float32(len(scale.table) - 1)
+    last_row, last_column = masks.shape[0] - 1, masks.shape[1] - 1
+    per_metre, deepest = np.float32(scale.per_metre), np.float32(len(table) - 1)
     constant, quadratic = np.float32(scale.constant), np.float32(scale.quadratic)
     floor, factor = np.float32(scale.floor), np.float32(place.factor)
     to_bin = np.float32(BINS * sqrt(32.0))
     shifted = np.float32(1 / sqrt(32.0))
     for block in chosen:
-        bx, by, bz = place_of(state.blocks.key[block])
+        bx, by, bz = place_of(key[block])
         for line in range(64):
             px = bx * SIDE * voxel
             py = (by * SIDE + line % SIDE) * voxel
@@ -360,13 +366,13 @@ def _add_to_blocks(
                 u_whole, v_whole = int(u_up), int(v_up)
                 row = min(max(v_whole - CELL, 0) // CELL, last_row)
                 column = min(max(u_whole - CELL, 0) // CELL, last_column)
-                mask = support.mask[row, column]
+                mask = masks[row, column]
                 if mask == uint64(0):
                     continue
                 sample = int(depth_at)
-                at = scale.table[sample] + (depth_at - np.float32(sample)) * (
-                    scale.table[sample + 1] - scale.table[sample])
-                bit = (int(at * to_bin) - support.base[row, column]) >> support.shift[row, column]
+                at = table[sample] + (depth_at - np.float32(sample)) * (
+                    table[sample + 1] - table[sample])
+                bit = (int(at * to_bin) - base[row, column]) >> shift[row, column]
                 if bit < 0 or bit > 63 or (mask >> uint64(bit)) & uint64(1) == 0:
                     continue
                 h3 = constant + quadratic * z * z
@@ -375,97 +381,73 @@ def _add_to_blocks(
                     h3, slope = floor, np.float32(0)
                 in_u = int((u_up - np.float32(u_whole)) * phases) * lanes
                 in_v = int((v_up - np.float32(v_whole)) * phases) * lanes
-                start = (
-                    (v_whole - CELL - half + image.pad) * image.stride
-                    + u_whole - CELL - half + image.pad)
+                start = (v_whole + offset) * stride + u_whole + offset
                 total = np.float32(0)
                 for strip in range(0, lanes, LANES):
                     total += window_strip(
-                        image.image, start + strip, image.stride, weights.table, in_v, lanes,
-                        weights.table, in_u + strip, at - slope * shifted)
+                        pixels, start + strip, stride, weight, in_v, lanes,
+                        weight, in_u + strip, at - slope * shifted)
                 value[first_voxel + i] += factor * total / h3
 
 
-class Scratch(NamedTuple):
-    """What one thread writes while it asks the lattice."""
-
-    weights: Floats
-    bases: NDArray[np.int64]
-    recent: NDArray[np.int64]  # key and number of the block last asked for
-
-
-@njit(cache=True, nogil=True)
-def new_scratch(state: Lattice) -> Scratch:
-    """Make one thread's scratch arrays."""
-    recent = np.zeros(2, np.int64)
-    recent[0] = -1
-    return Scratch(np.zeros(36, np.float32), np.zeros(4, np.int64), recent)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def jet_along(
-    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles, distance: float,
-    h3: float,
-) -> tuple[float, float, float, float]:
+@njit(inline='always')
+def _jet(
+    coefficient: Floats, neighbour: NDArray[np.int32], table_key: NDArray[np.int64],
+    table_block: NDArray[np.int32], voxel: float, bases: NDArray[np.int64],
+    recent: NDArray[np.int64], origin: Doubles, direction: Doubles, distance: float,
+) -> tuple[float, float, float]:
     """
     Evaluate the spline at a point of a world line; all 0 where there is no block.
 
-    :return: C f, C f', C f'', and g such that f'/g is the mean-shift step of a frontal surface
+    The lattice's arrays come one by one: taken out of it in the inner loop, each would be counted
+    as in use, which costs more than the evaluation.
+
+    :param bases: (4,), where the blocks of the last point begin
+    :param recent: (1,), the key of its first block
+    :return: C f, C f', C f''
     """
-    per_voxel = 1.0 / state.voxel
+    per_voxel = 1.0 / voxel
     x = (origin[0] + distance * direction[0]) * per_voxel
     y = (origin[1] + distance * direction[1]) * per_voxel
     z = (origin[2] + distance * direction[2]) * per_voxel
     i, j, k = int64(np.floor(x)), int64(np.floor(y)), int64(np.floor(z))
     # the first of the four taps is one before
     key = key_of((i - 1) >> 3, (j - 1) >> 3, (k - 1) >> 3)
-    if key != scratch.recent[0]:
-        block = find(state.blocks, key)
-        scratch.recent[0] = key
-        scratch.recent[1] = block
-        for n, neighbour in enumerate((13, 16, 22, 25)):  # itself, next in y, in z, in both
-            scratch.bases[n] = (
-                int64(state.blocks.neighbour[block, neighbour]) * lattice.COEFFICIENTS)
-    if scratch.recent[1] == 0:
-        return 0.0, 0.0, 0.0, 0.0
-    w = scratch.weights
-    spline_weights(w, 0, np.float32(z - k), np.float32(direction[2] * per_voxel))
-    spline_weights(w, 12, np.float32(y - j), np.float32(direction[1] * per_voxel))
-    spline_weights(w, 24, np.float32(x - i), np.float32(direction[0] * per_voxel))
+    if key != recent[0]:
+        recent[0] = key
+        block = find(table_key, table_block, key)
+        for n, other in enumerate((13, 16, 22, 25)):  # itself, next in y, in z, in both
+            bases[n] = int64(neighbour[block, other]) * lattice.COEFFICIENTS
+    # block 0 holds zeros, so what is not there needs no case of its own
     f, f1, f2 = spline_jet(
-        state.blocks.coefficient, scratch.bases, (i - 1) & 7, (j - 1) & 7, (k - 1) & 7, w)
-    return float(f), float(f1), float(f2), float(f) / (h3 * h3)
+        coefficient, bases, (i - 1) & 7, (j - 1) & 7, (k - 1) & 7,
+        np.float32(x - i), np.float32(y - j), np.float32(z - k),
+        np.float32(direction[0] * per_voxel), np.float32(direction[1] * per_voxel),
+        np.float32(direction[2] * per_voxel))
+    return np.float64(f), np.float64(f1), np.float64(f2)
 
 
 @njit(cache=True, nogil=True)
-def prepare(
-    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles,
-    low: float, high: float,
-) -> None:
-    """Do nothing: a lattice is asked at points."""
-
-
-@njit(cache=True, nogil=True)
-def changed_since(
-    state: Lattice, scratch: Scratch, origin: Doubles, direction: Doubles,
-    low: float, high: float, change: int,
+def _changed_since(
+    state: Lattice, origin: Doubles, direction: Doubles, low: float, high: float, change: int
 ) -> bool:
     """Tell whether the spline on a piece of a line changed after a change."""
+    blocks = state.blocks
     steps = int((high - low) / state.voxel) + 1
     last = int64(-1)
     for step in range(steps + 1):
-        key = _key_along(state, origin, direction, low + (high - low) * step / steps)
+        key = _key_along(state.voxel, origin, direction, low + (high - low) * step / steps)
         if key != last:
             last = key
-            if state.blocks.filtered[find(state.blocks, key)] > change:
+            if blocks.filtered[find(blocks.table_key, blocks.table_block, key)] > change:
                 return True
     return False
 
 
 @njit(cache=True, nogil=True)
-def _key_along(state: Lattice, origin: Doubles, direction: Doubles, distance: float) -> np.int64:
+def _key_along(voxel: float, origin: Doubles, direction: Doubles, distance: float) -> np.int64:
     """Return the key of the block that holds the first spline tap of a point of a line."""
-    per_voxel = 1.0 / state.voxel
+    per_voxel = 1.0 / voxel
     i = int64(np.floor((origin[0] + distance * direction[0]) * per_voxel))
     j = int64(np.floor((origin[1] + distance * direction[1]) * per_voxel))
     k = int64(np.floor((origin[2] + distance * direction[2]) * per_voxel))
@@ -484,7 +466,7 @@ def keys_along(
         steps = int((highs[n] - lows[n]) / state.voxel) + 1
         for step in range(steps + 1):
             key = _key_along(
-                state, origin, directions[n], lows[n] + (highs[n] - lows[n]) * step / steps)
+                state.voxel, origin, directions[n], lows[n] + (highs[n] - lows[n]) * step / steps)
             if key == recent[0] or key == recent[1] or key == recent[2] or key == recent[3]:
                 continue
             recent[count % 4] = key
@@ -502,9 +484,60 @@ def _jets(
     state: Lattice, origins: Doubles, directions: Doubles, distances: Doubles, out: Doubles
 ) -> None:
     """Write the jets of lines to out (n, 3); one direction and distance may serve all."""
-    scratch = new_scratch(state)
+    bases, recent = np.zeros(4, np.int64), np.full(1, -1, np.int64)
+    coefficient, neighbour = state.blocks.coefficient, state.blocks.neighbour
+    table_key, table_block = state.blocks.table_key, state.blocks.table_block
     for n in range(len(origins)):
         m = min(n, len(directions) - 1)
-        f, f1, f2, _ = jet_along(
-            state, scratch, origins[n], directions[m], distances[m], 1.0)
+        f, f1, f2 = _jet(
+            coefficient, neighbour, table_key, table_block, state.voxel, bases, recent,
+            origins[n], directions[m], distances[m])
         out[n, 0], out[n, 1], out[n, 2] = f, f1, f2
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def march_rays(
+    state: Lattice, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
+    pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,
+    depths: Floats, totals: Floats, statuses: NDArray[np.uint8], counts: NDArray[np.uint8],
+) -> None:
+    """Climb from the starts of chosen rays; see ray_march.Rays for the arrays."""
+    bases, recent = np.zeros(4, np.int64), np.full(1, -1, np.int64)
+    coefficient, neighbour = state.blocks.coefficient, state.blocks.neighbour
+    table_key, table_block = state.blocks.table_key, state.blocks.table_block
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in chosen:
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        h3 = h3_at(bandwidth, start)
+        ray = set_out(start)
+        count = 0
+        while ray.status == 0 and count < MAX_ITERATIONS:
+            f, f1, f2 = _jet(
+                coefficient, neighbour, table_key, table_block, state.voxel, bases, recent,
+                origin, direction, ray.target)
+            # the mean-shift's g, as on a surface that faces its cameras
+            ray = climb(ray, start, h3, f, f1, f2, f / (h3 * h3))
+            count += 1
+        depths[i] = ray.beta
+        totals[i] = ray.value
+        statuses[i] = ray.status if ray.status != 0 else Status.ITERATION_LIMIT
+        counts[i] = count
+
+
+@njit(cache=True, nogil=True)
+def changed_rays(
+    state: Lattice, bandwidth: tuple[float, float, float], pixels: NDArray[np.int32],
+    table: Doubles, T_world_camera: Doubles, starts: Floats, marched: NDArray[np.int32],
+    out: NDArray[np.bool_],
+) -> None:
+    """Tell of each ray whether the density in its interval changed since it was marched."""
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in range(len(pixels)):
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        reach = INTERVAL * h3_at(bandwidth, start)
+        out[i] = marched[i] < 0 or _changed_since(
+            state, origin, direction, start - reach, start + reach, marched[i])

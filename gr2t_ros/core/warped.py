@@ -172,11 +172,12 @@ def empty_support(height: int, width: int) -> Support:
 @njit(cache=True, nogil=True)
 def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int) -> None:
     """Fill in the support of rows of cells, from first to end."""
+    base_of, shift_of, mask_of = support.base, support.shift, support.mask
     height, width = bins.shape
     reach = int(np.ceil(SUPPORT * BINS))
     for j in range(first, end):
         top, bottom = max(CELL * j - _MARGIN, 0), min(CELL * (j + 1) + _MARGIN, height)
-        for i in range(support.mask.shape[1]):
+        for i in range(mask_of.shape[1]):
             left, right = max(CELL * i - _MARGIN, 0), min(CELL * (i + 1) + _MARGIN, width)
             low, high = 2 ** 30, -1
             for v in range(top, bottom):
@@ -185,7 +186,7 @@ def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int
                     if b >= 0:
                         low = min(low, b)
                         high = max(high, b)
-            support.mask[j, i] = uint64(0)
+            mask_of[j, i] = uint64(0)
             if high < 0:
                 continue
             base = low - reach
@@ -205,9 +206,9 @@ def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int
                             a = uint64((b - reach - base) >> shift)
                             c = uint64((b + reach - base) >> shift)
                             mask |= ((uint64(2) << (c - a)) - uint64(1)) << a
-            support.base[j, i] = base
-            support.shift[j, i] = shift
-            support.mask[j, i] = mask
+            base_of[j, i] = base
+            shift_of[j, i] = shift
+            mask_of[j, i] = mask
 
 
 @njit(cache=True, nogil=True)
@@ -226,6 +227,7 @@ def robust_starts(
     :param starts: (n,) float32, metres: the observed depths; outliers are replaced
     """
     image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
+    weight = weights.table
     lanes = weights.lanes
     half = lanes // 2 - 1
     for n in range(len(pixels)):
@@ -235,9 +237,9 @@ def robust_starts(
         observed = np.float32(0)
         for strip in range(0, lanes, LANES):
             observed += window_strip(
-                image, first + strip, stride, weights.table, 0, lanes, weights.table, strip,
+                image, first + strip, stride, weight, 0, lanes, weight, strip,
                 image[centre])
-        observed -= weights.table[half] * weights.table[half]
+        observed -= weight[half] * weight[half]
         if observed >= _OUTLIER:
             continue  # no depth can have more than 1
         best, best_pixel = observed, pixels[n]
@@ -249,9 +251,8 @@ def robust_starts(
                 share = np.float32(0)
                 for strip in range(0, lanes, LANES):
                     share += window_strip(
-                        image, first + strip, stride, weights.table, 0, lanes, weights.table,
-                        strip, image[at])
-                share -= weights.table[half + row] * weights.table[half + column]
+                        image, first + strip, stride, weight, 0, lanes, weight, strip, image[at])
+                share -= weight[half + row] * weight[half + column]
                 if share > best:
                     best, best_pixel = share, pixels[n] + row * width + column
         if observed < _OUTLIER * best:
