@@ -11,6 +11,8 @@ ROS_PACKAGES = (
     'visualization-msgs', 'diagnostic-msgs', 'rmw-fastrtps-cpp',
 )
 
+TEST_PACKAGES = ['hypothesis>=6.100', 'pytest>=8.0', 'pytransform3d>=3.5']
+
 setup(
     name=NAME,
     version='0.1.0',
@@ -50,12 +52,12 @@ setup(
         'kilted': [f'ros-kilted-{name}' for name in ROS_PACKAGES],
         'jazzy': [f'ros-jazzy-{name}' for name in ROS_PACKAGES],
         'simulation': ['embreex>=2.17'],
+        # colcon test runs pytest because it is named in this one.
+        'test': TEST_PACKAGES,
         'dev': [
+            *TEST_PACKAGES,
             'colcon-common-extensions>=0.3',
-            'hypothesis>=6.100',
             'mypy>=1.11',
-            'pytest>=8.0',
-            'pytransform3d>=3.5',
             'ruff>=0.6',
             'types-PyYAML',
         ],

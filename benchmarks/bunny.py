@@ -5,33 +5,36 @@ How far from the truth the vertices lie, and what a ray costs: 12 simulated view
 
     python benchmarks/bunny.py bunny.ply [--json out.json]
 
-Beside it, where it is installed, Open3D's TSDF of the same images (1 mm voxels, weight >= 3).
+The exact density and the lattice (1 mm voxels); beside them, where it is installed, Open3D's TSDF
+of the same images (1 mm voxels, weight >= 3).
 """
 from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 import json
-import os
-import platform
 from time import perf_counter
+from typing import Any
 
+from common import bunny_views, machine, table
 import numpy as np
 from numpy.typing import NDArray
 import trimesh
+import tsdf
 
-from gr2t_ros.core.ray_march import march, rays_of, Status
+from gr2t_ros.core.ray_march import march, rays_of
 from gr2t_ros.core.reconstruction import Reconstruction, warm_up
 from gr2t_ros.core.view import View
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.distance import Surface
 from gr2t_ros.tools.noise import Noise
-from gr2t_ros.tools.simulate import simulated_views
 
 SETTINGS = Settings(
-    pixel_bandwidth=1.5, depth_bandwidth=0.001, depth_bandwidth_quadratic=0.0,
+    depth_bandwidth=0.001, depth_bandwidth_quadratic=0.0, voxel_size=0.001,
     keyframe_translation=0.0)
+DENSITIES = ('exact', 'voxel')
 CASES = {
     '32FC1, no noise': ('32FC1', None),
     '16UC1, no noise': ('16UC1', None),
@@ -39,11 +42,12 @@ CASES = {
 }
 PAPER_SECONDS = 0.5162  # a ray, Grogan & Dahyot 2014
 REPEATS = 3
+TSDF_WEIGHT = 2.5  # three views
 
 
-def reconstructed(views: Sequence[View]) -> Reconstruction:
+def reconstructed(views: Sequence[View], density: str) -> Reconstruction:
     """Return the finished reconstruction of the views, each a keyframe."""
-    reconstruction = Reconstruction(SETTINGS.updated({'remarch_budget': 0.0}))
+    reconstruction = Reconstruction(SETTINGS.updated({'remarch_budget': 0.0, 'density': density}))
     for view in views:
         reconstruction.add(view)
     reconstruction.finish()
@@ -59,91 +63,72 @@ def distances_mm(surface: Surface, points: NDArray[np.float64]) -> dict[str, flo
 
 
 def ray_cost(reconstruction: Reconstruction, threads: int) -> dict[str, float]:
-    """March every ray of every keyframe once more, and the best of some runs."""
+    """March every ray of every keyframe once more, and return the best of some runs."""
     density = reconstruction.density
+    runs = []
     with ThreadPoolExecutor(threads) as pool:
-        best: dict[str, float] = {}
         for _ in range(REPEATS):
             began = perf_counter()
             rays = [
-                rays_of(density, index, keyframe.view, 1, 'robust', pool)
-                for index, keyframe in enumerate(reconstruction.keyframes)]
+                rays_of(density, keyframe.view, 1, SETTINGS.start, pool)
+                for keyframe in reconstruction.keyframes]
             started = perf_counter()
             for one in rays:
-                march(density, one, np.ones(len(one.pixels), np.bool_), pool)
+                march(density, one, np.arange(len(one.pixels)), pool)
             ended = perf_counter()
             count = sum(len(one.pixels) for one in rays)
-            if not best or (ended - started) / count * 1e6 < best['march_us']:
-                status = np.concatenate([one.status for one in rays])
-                best = {
-                    'start_us': (started - began) / count * 1e6,
-                    'march_us': (ended - started) / count * 1e6,
-                    'evaluations': float(np.mean(
-                        np.concatenate([one.iterations for one in rays]))),
-                    'converged': float(np.mean(status == Status.CONVERGED)),
-                    'rays': count}
-    return best
+            runs.append({
+                'start us': 1e6 * (started - began) / count,
+                'march us': 1e6 * (ended - started) / count,
+                'evaluations': float(np.mean(np.concatenate([one.iterations for one in rays]))),
+                'converged': float(np.mean(np.concatenate([one.converged for one in rays])))})
+    return min(runs, key=lambda run: run['march us'])
 
 
-def tsdf_vertices(views: Sequence[View]) -> NDArray[np.float64] | None:
-    """Return the vertices of Open3D's TSDF of the same depth images, or None without Open3D."""
-    try:
-        import open3d
-    except ImportError:
-        return None
-    core = open3d.core
-    grid = open3d.t.geometry.VoxelBlockGrid(
-        ('tsdf', 'weight'), (core.float32, core.float32), ((1), (1)), 0.001, 8, 40000)
+def tsdf_vertices(views: Sequence[View]) -> NDArray[np.float64]:
+    """Return the vertices of Open3D's TSDF of the same depth images."""
+    grid = tsdf.Tsdf(SETTINGS.voxel_size, SETTINGS.depth_max)
     for view in views:
-        camera = view.camera
-        K = core.Tensor([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1.0]])
-        T = core.Tensor(np.linalg.inv(view.T_world_camera))
-        depth = open3d.t.geometry.Image(core.Tensor(np.nan_to_num(view.depth)))
-        blocks = grid.compute_unique_block_coordinates(depth, K, T, 1.0, 5.0, 4.0)
-        grid.integrate(blocks, depth, K, T, 1.0, 5.0, 4.0)
-    mesh = grid.extract_triangle_mesh(weight_threshold=3.0)
-    return mesh.vertex.positions.numpy().astype(np.float64)
+        grid.integrate(tsdf.Frame(view))
+    return grid.vertices(TSDF_WEIGHT)
 
 
 def main() -> None:
-    """Measure, print a table, write JSON where asked."""
+    """Measure, print tables, write JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
     parser.add_argument('mesh', help='the true surface, metres')
     parser.add_argument('--json', metavar='FILE', help='also write the figures there')
     arguments = parser.parse_args()
     mesh = trimesh.load_mesh(arguments.mesh)
     surface = Surface(mesh.triangles)
-    print(f'{platform.processor() or platform.machine()}, {os.cpu_count()} cores, '
-          f'Python {platform.python_version()}; kernels ready in {warm_up(SETTINGS):.1f} s')
-    figures: dict[str, object] = {}
-    print(f'\n{"distance to the truth, mm":28}{"mean":>8}{"median":>8}{"p95":>8}{"vertices":>10}')
-    for name, (encoding, noise) in CASES.items():
-        views = simulated_views(mesh, 12, 0.35, encoding=encoding, noise=noise)
-        reconstruction = reconstructed(views)
-        vertices = np.concatenate([m.vertices for _, m in reconstruction.meshes()])
-        rows = {'ours': vertices, 'TSDF': tsdf_vertices(views)}
-        for method, points in rows.items():
-            if points is None:
-                print(f'{name + ": " + method:28} Open3D is not installed')
-                continue
-            found = distances_mm(surface, points)
-            figures[f'{name}, {method}'] = found
-            print(f'{name + ": " + method:28}{found["mean"]:8.3f}{found["median"]:8.3f}'
-                  f'{found["p95"]:8.3f}{found["vertices"]:10d}')
-        if name == next(iter(CASES)):
-            costs = {threads: ray_cost(reconstruction, threads) for threads in (1, 2)}
-        reconstruction.close()
-    print(f'\n{"a ray, 12 views":28}{"start us":>10}{"march us":>10}{"evaluations":>13}'
-          f'{"converged":>11}{"x the paper":>13}')
-    for threads, cost in costs.items():
-        figures[f'ray, {threads} threads'] = cost
-        faster = PAPER_SECONDS / (1e-6 * (cost['start_us'] + cost['march_us']))
-        print(f'{threads} thread{"s" * (threads > 1):21}{cost["start_us"]:10.2f}'
-              f'{cost["march_us"]:10.2f}{cost["evaluations"]:13.2f}{cost["converged"]:11.4f}'
-              f'{faster:13.0f}')
+    about = machine()
+    print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}; kernels ready '
+          f'in {sum(warm_up(SETTINGS.updated({"density": name})) for name in DENSITIES):.1f} s')
+    if not tsdf.INSTALLED:
+        print('Open3D is not installed: no TSDF')
+    distances: list[dict[str, Any]] = []
+    costs: list[dict[str, Any]] = []
+    for case, (encoding, noise) in CASES.items():
+        views = bunny_views(mesh, noise, encoding)
+        for density in DENSITIES:
+            with closing(reconstructed(views, density)) as reconstruction:
+                vertices = np.concatenate([m.vertices for _, m in reconstruction.meshes()])
+                distances.append({'images': case, 'density': density} | distances_mm(
+                    surface, vertices))
+                if case == next(iter(CASES)):
+                    costs += [
+                        {'density': density, 'threads': threads} | ray_cost(
+                            reconstruction, threads) for threads in (1, 2)]
+        if tsdf.INSTALLED:
+            distances.append({'images': case, 'density': 'TSDF'} | distances_mm(
+                surface, tsdf_vertices(views)))
+    for cost in costs:
+        cost['x the paper'] = PAPER_SECONDS / (1e-6 * (cost['start us'] + cost['march us']))
+    table('distance to the truth, mm', distances)
+    table(f'a ray, {len(views)} views', costs)
     if arguments.json:
         with open(arguments.json, 'w', encoding='utf-8') as file:
-            json.dump(figures, file, indent=1)
+            json.dump({'machine': about, 'distances': distances, 'ray': costs}, file, indent=1)
 
 
 if __name__ == '__main__':

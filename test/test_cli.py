@@ -56,10 +56,16 @@ def test_version_is_printed() -> None:
     ([], 'gr2t: the following arguments are required: COMMAND; see gr2t --help'),
     (['reply'], "gr2t: argument COMMAND: invalid choice: 'reply'"),
     (['info'], 'gr2t: the following arguments are required: BAG; see gr2t info --help'),
-    (['replay', 'a.bag', '--star', 'soon'], 'gr2t: argument --start: invalid'),
+    (['replay', 'a.bag', '--star', 'soon'],
+     'gr2t: argument --start: must be a time in seconds, not soon'),
     (['replay', 'a.bag', '--start', '-1'], 'gr2t: argument --start: must be a time in seconds'),
-    (['replay', 'a.bag', '--max-frames', '0'], 'gr2t: argument --max-frames: must be at least 1'),
-    (['replay', 'a.bag', '--fast'], 'gr2t: unrecognized arguments: --fast'),
+    (['replay', 'a.bag', '--max-frames', '0'],
+     'gr2t: argument --max-frames: must be a whole number of at least 1, not 0'),
+    (['replay', 'a.bag', '--max-frames', 'ten'],
+     'gr2t: argument --max-frames: must be a whole number of at least 1, not ten'),
+    (['replay', 'a.bag', '--frames', '3'], 'gr2t: unknown argument --frames 3 '
+     '(did you mean --max-frames?); see gr2t replay --help'),
+    (['evaluate', 'a', 'b', 'c'], 'gr2t: unknown argument c; see gr2t evaluate --help'),
     (['replay', 'a.bag', '-p', 'dept_max:=3'],
      'gr2t: unknown parameter dept_max; did you mean depth_max?'),
     (['replay', 'a.bag', '-p', 'depth_max=3'], 'gr2t: -p depth_max=3: write it as name:=value'),
@@ -159,6 +165,7 @@ def test_a_file_that_was_cut_off_is_one_line(
     assert code == 2
     assert err.startswith(f'gr2t: {path} cannot be read (')
     assert 'it is damaged, cut off or no bag' in err
+    assert ('mcap recover' in err) == kind.startswith('mcap')
     assert err.count('\n') == 1
 
 
@@ -167,9 +174,11 @@ def test_other_files_and_folders_are_no_bags(gr2t: Call, tmp_path: Path) -> None
     (tmp_path / 'noise.bag').write_bytes(bytes(range(256)) * 10)
     (tmp_path / 'folder').mkdir()
     (tmp_path / 'folder' / 'scan.mcap').touch()
+    (tmp_path / 'empty').mkdir()
     for name, sentence in (
             ('notes.txt', 'is not a bag'), ('noise.bag', 'cannot be read (File magic is invalid'),
-            ('folder', 'has no metadata.yaml; name the files inside instead: folder/scan.mcap')):
+            ('folder', 'has no metadata.yaml; name the files inside instead: folder/scan.mcap'),
+            ('empty', 'has no metadata.yaml and no .bag, .mcap or .db3 file')):
         code, _, err = gr2t('info', name)
         assert code == 2
         assert sentence in err
@@ -206,7 +215,8 @@ def test_info_says_what_is_ambiguous_or_missing(gr2t: Call, tmp_path: Path) -> N
     code, out, _ = gr2t('info', bags.write(
         tmp_path / 'two', [*bags.scan(), bags.image(0, other)]))
     assert code == 0
-    assert f'several depth topics; add\n  --depth-topic {DEPTH}\n  --depth-topic {other}\n' in out
+    assert ('several depth topics; add one of\n'
+            f'  --depth-topic {DEPTH}\n  --depth-topic {other}\n') in out
     code, out, _ = gr2t('info', bags.write(tmp_path / 'none', without('/tf')))
     assert code == 0
     assert 'holds no poses of the camera' in out

@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Distances are exact, and the measures are those that docs/simulation.md defines."""
 import json
+from pathlib import Path
 
 import numpy as np
 from numpy.testing import assert_allclose
@@ -119,6 +120,12 @@ def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):
     assert cli.main(['evaluate', *files]) == 0
     text = capsys.readouterr().out
     assert '(mm)' in text and 'completeness %' in text and 'most likely' in text
+
+
+def test_a_folder_does_not_hide_the_built_in_scene(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / 'tabletop').mkdir()  # such as the recording of it
+    assert len(load_mesh(Path('tabletop')).faces) == len(tabletop().faces)
 
 
 def test_a_mesh_without_likelihoods_has_no_confidence_curve(tmp_path, capsys):

@@ -70,3 +70,10 @@ def test_the_table_names_files_and_reasons(run: report.Run) -> None:
     assert 'dropped  2 no_pose: no pose at all' in lines
     assert 'note     a NaN transform' in lines
     assert 'damage   used up to 3 s' in lines
+    assert 'rays     100 marched, 50 times again; 93.3 % converged' in lines
+
+
+def test_an_empty_mesh_is_said(run: report.Run) -> None:
+    for vertices in (0, 3):
+        text = report.table(report.report(run, {'vertices': vertices}, []), run, {})
+        assert ('the mesh is empty' in text) == (vertices == 0)

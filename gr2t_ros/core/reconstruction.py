@@ -182,7 +182,11 @@ class Reconstruction:
         voxel_size, notice = s.voxel_size, ''
         if voxel_size == 0:
             seen = view.depth[np.isfinite(view.depth)]
-            median = float(np.median(seen)) if len(seen) else s.depth_max / 2
+            if not len(seen):
+                raise FrameError(
+                    'no_valid_depth', 'the first depth image has no valid depth to choose a '
+                    'voxel size from; the next one may')
+            median = float(np.median(seen))
             voxel_size = s.depth_bandwidth + s.depth_bandwidth_quadratic * median ** 2
             notice = (
                 f'voxel_size is {1000 * voxel_size:.3g} mm: h3 at the first frame\'s median '
@@ -273,13 +277,19 @@ class Reconstruction:
         return self._once(
             'aliasing', f'{density.aliased_pixels / density.pixels:.0%} of the pixels are too '
             f'near for voxels of {1000 * density.voxel_size:.3g} mm: detail smaller than that is '
-            f'lost there; voxel_size:={fitting:.2g} would keep it')
+            f'lost there; voxel_size:={_rounded_down(fitting):g} would keep it')
 
     def _once(self, topic: str, sentence: str) -> list[str]:
         if topic in self._noticed:
             return []
         self._noticed.add(topic)
         return [sentence]
+
+
+def _rounded_down(value: float) -> float:
+    """Return a positive number with two digits, not above it."""
+    digit = 10.0 ** (np.floor(np.log10(value)) - 1)
+    return float(np.floor(value / digit) * digit)
 
 
 def warm_up(settings: Settings) -> float:

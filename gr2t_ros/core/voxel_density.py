@@ -17,7 +17,7 @@ from numba import int64, njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from ..errors import FrameError, InputError
 from . import blocks as lattice
 from .blocks import Blocks, find, key_of, place_of, SIDE, VOXELS
 from .camera import Camera, project_jet
@@ -27,6 +27,7 @@ from .view import View
 from .warped import (
     BINS,
     CELL,
+    depth_ranges,
     empty_support,
     find_support,
     Scale,
@@ -42,6 +43,7 @@ Floats = NDArray[np.float32]
 _ROWS_OF_CELLS = 15  # a task
 _BLOCKS = 64  # a task
 _POINTS = 4096  # a task
+_CELL_BITS = 2  # of CELL
 _FINEST = 1.5  # voxels wider than this many lateral bandwidths alias
 
 
@@ -89,6 +91,7 @@ class VoxelDensity:
             raise InputError('voxel_size must be positive')
         self.voxel_size = voxel_size
         self.pixel_bandwidth = pixel_bandwidth
+        self.depth_max = depth_max
         # h3(z) = max(constant + quadratic z^2, floor)
         self.bandwidth = (
             float(depth_bandwidth), float(depth_bandwidth_quadratic), float(voxel_size))
@@ -119,11 +122,7 @@ class VoxelDensity:
 
     def add(self, view: View, pool: Executor | None = None) -> None:
         """Add a view's kernels."""
-        self._accumulate(view, 1.0, pool)
-        self.size += 1
-        self.pixels += int(np.count_nonzero(np.isfinite(view.depth)))
-        nearest = self.voxel_size / self.finest_voxel(1.0, view.camera)
-        self.aliased_pixels += int(np.count_nonzero(view.depth < nearest))
+        self._accumulate(view, 1, pool)
 
     def cover(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """
@@ -141,7 +140,7 @@ class VoxelDensity:
 
     def finest_voxel(self, depth: float, camera: Camera) -> float:
         """Return the widest voxel (metres) that follows the lateral kernel at a depth."""
-        return _FINEST * self.pixel_bandwidth * depth / min(camera.fx, camera.fy)
+        return _FINEST * self.pixel_bandwidth * depth / max(camera.fx, camera.fy)
 
     def share_changed(self, watched: NDArray[np.int32], change: int) -> float:
         """Return the share of some blocks whose spline changed after a change."""
@@ -149,8 +148,7 @@ class VoxelDensity:
 
     def remove(self, view: View, pool: Executor | None = None) -> None:
         """Subtract what add() added for the same view."""
-        self._accumulate(view, -1.0, pool)
-        self.size -= 1
+        self._accumulate(view, -1, pool)
 
     def refresh(self, pool: Executor | None = None) -> None:
         """Bring the spline up to date with the samples; before asking for anything."""
@@ -196,8 +194,19 @@ class VoxelDensity:
         jets /= max(self.size, 1)
         return jets[:, 0], jets[:, 1], jets[:, 2]
 
-    def _accumulate(self, view: View, sign: float, pool: Executor | None) -> None:
+    def _check_reach(self, view: View) -> None:
+        """Refuse a camera from where a block's number could not be written down."""
+        reach = 2.0 ** 20 * SIDE * self.voxel_size
+        away = float(np.abs(view.T_world_camera[:3, 3]).max())
+        if not away + 4 * self.depth_max < reach:
+            raise FrameError(
+                'out_of_range', f'the camera is {away:.0f} m from the origin of the world frame; '
+                f'with voxels of {1000 * self.voxel_size:g} mm a map reaches {reach:.0f} m: '
+                'choose a nearer world_frame')
+
+    def _accumulate(self, view: View, sign: int, pool: Executor | None) -> None:
         height, width = view.depth.shape
+        self._check_reach(view)
         T = np.asarray(view.T_world_camera, np.float64)
         R_world_camera = np.ascontiguousarray(T[:3, :3])
         R_camera_world = np.ascontiguousarray(R_world_camera.T)
@@ -211,10 +220,16 @@ class VoxelDensity:
         rows = [
             (i, min(i + _ROWS_OF_CELLS, len(support.mask)))
             for i in range(0, len(support.mask), _ROWS_OF_CELLS)]
-        _all(pool, find_support, [(image.bins, support, *part) for part in rows])
+        ranges = depth_ranges(image.bins)
+        _all(pool, find_support, [
+            (image.bins, *ranges, self.weights.lanes, support, *part) for part in rows])
         keys = _all(pool, _keys, [
             (support, view.camera.rays, R_world_camera, T[:3, 3].copy(), self._depth_of_bins,
-             SIDE * self.voxel_size, *part) for part in rows])
+             SIDE * self.voxel_size, self.weights.lanes // 2, *part) for part in rows])
+        self.size += sign
+        self.pixels += sign * int(np.count_nonzero(np.isfinite(view.depth)))
+        nearest = self.voxel_size / self.finest_voxel(1.0, view.camera)
+        self.aliased_pixels += sign * int(np.count_nonzero(view.depth < nearest))
         self._change += 1
         self.blocks, touched = lattice.with_keys(
             self.blocks, np.concatenate(keys), self._change)
@@ -235,26 +250,49 @@ def _all(
     return [done.result() for done in [pool.submit(task, *one) for one in arguments]]
 
 
+@njit(cache=True, nogil=True)
+def _ray(rays: Doubles, u: int, v: int) -> tuple[float, float]:
+    """Return a pixel's ray, going on in a straight line outside the image; NaN where unknown."""
+    height, width = rays.shape[:2]
+    u_in, v_in = min(max(u, 0), width - 1), min(max(v, 0), height - 1)
+    a, b = rays[v_in, u_in, 0], rays[v_in, u_in, 1]
+    if u != u_in and width > 1:
+        inner = 1 if u < 0 else width - 2
+        a += abs(u - u_in) * (a - rays[v_in, inner, 0])
+    if v != v_in and height > 1:
+        inner = 1 if v < 0 else height - 2
+        b += abs(v - v_in) * (b - rays[inner, u_in, 1])
+    return a, b
+
+
 @njit(cache=True, nogil=True, error_model='numpy')
 def _keys(
     support: Support, rays: Doubles, R_world_camera: Doubles, t_world_camera: Doubles,
-    depth_of_bins: Doubles, block_size: float, first: int, end: int,
+    depth_of_bins: Doubles, block_size: float, rim: int, first: int, end: int,
 ) -> NDArray[np.int64]:
     """
     Return the keys of the blocks that some rows of cells have support in, with repetitions.
 
-    Each cell's ray is followed through the runs of its mask, in steps that miss no block by more
-    than a corner; where a cell is wide against a block, several rays are.
+    A ray in the middle of each cell is followed through the runs of its mask, in steps that miss
+    no block by more than a corner. More rays are where a cell is wide against a block, where some
+    of its pixels have no ray, and at the border, where kernels reach rim pixels out of the image.
     """
     out = np.zeros(4096, np.int64)
     count = 0
     last, before = int64(-1), int64(-1)
-    height, width = rays.shape[:2]
+    rows, columns = support.mask.shape
+    R, t = R_world_camera, t_world_camera
     for j in range(first, end):
-        for i in range(support.mask.shape[1]):
+        for i in range(columns):
             mask = support.mask[j, i]
             if mask == 0:
                 continue
+            u0, v0, u1, v1 = CELL * i, CELL * j, CELL * (i + 1), CELL * (j + 1)
+            a, b = _ray(rays, u0, v0)
+            c, d = _ray(rays, u1, v1)
+            spread = abs(c - a) + abs(d - b)
+            inside = 0 < i < columns - 1 and 0 < j < rows - 1 and np.isfinite(
+                spread + _ray(rays, u0, v1)[0] + _ray(rays, u1, v0)[0])
             base, shift = support.base[j, i], support.shift[j, i]
             bit = 0
             while bit < 64 and (mask >> uint64(bit)) != 0:
@@ -266,37 +304,34 @@ def _keys(
                 top = len(depth_of_bins) - 1
                 near = depth_of_bins[min(max(base + (start << shift), 0), top)]
                 far = depth_of_bins[min(max(base + (bit << shift), 0), top)]
-                u0, v0 = CELL * i, CELL * j
-                u1, v1 = min(u0 + CELL - 1, width - 1), min(v0 + CELL - 1, height - 1)
-                across = abs(rays[v1, u1, 0] - rays[v0, u0, 0]) + abs(
-                    rays[v1, u1, 1] - rays[v0, u0, 1])
-                # (a cell without rays at its corners holds nothing that a neighbour lacks)
-                if not across < 1e3:
-                    continue
-                lines = int(far * across / block_size) + 1
                 steps = int(2.5 * (far - near) / block_size) + 1
-                for line in range(lines * lines):
-                    p = (line % lines + 0.5) / lines
-                    q = (line // lines + 0.5) / lines
-                    a = rays[v0, u0, 0] + p * (rays[v0, u1, 0] - rays[v0, u0, 0])
-                    b = rays[v0, u0, 1] + q * (rays[v1, u0, 1] - rays[v0, u0, 1])
-                    x = R_world_camera[0, 0] * a + R_world_camera[0, 1] * b + R_world_camera[0, 2]
-                    y = R_world_camera[1, 0] * a + R_world_camera[1, 1] * b + R_world_camera[1, 2]
-                    z = R_world_camera[2, 0] * a + R_world_camera[2, 1] * b + R_world_camera[2, 2]
-                    for step in range(steps + 1):
-                        depth = near + (far - near) * step / steps
-                        key = key_of(
-                            int(np.floor((t_world_camera[0] + depth * x) / block_size)),
-                            int(np.floor((t_world_camera[1] + depth * y) / block_size)),
-                            int(np.floor((t_world_camera[2] + depth * z) / block_size)))
-                        if key != last and key != before:
-                            before, last = last, key
-                            if count == len(out):
-                                longer = np.zeros(2 * count, np.int64)
-                                longer[:count] = out
-                                out = longer
-                            out[count] = key
-                            count += 1
+                stride = 1
+                if spread * far <= block_size:
+                    stride = CELL if inside else 2
+                for v in range(v0 + stride // 2 - rim * (j == 0), v1 + rim * (j == rows - 1),
+                               stride):
+                    for u in range(u0 + stride // 2 - rim * (i == 0),
+                                   u1 + rim * (i == columns - 1), stride):
+                        a, b = _ray(rays, u, v)
+                        if not abs(a + b) < np.inf:
+                            continue
+                        x = R[0, 0] * a + R[0, 1] * b + R[0, 2]
+                        y = R[1, 0] * a + R[1, 1] * b + R[1, 2]
+                        z = R[2, 0] * a + R[2, 1] * b + R[2, 2]
+                        for step in range(steps + 1):
+                            depth = near + (far - near) * step / steps
+                            key = key_of(
+                                int(np.floor((t[0] + depth * x) / block_size)),
+                                int(np.floor((t[1] + depth * y) / block_size)),
+                                int(np.floor((t[2] + depth * z) / block_size)))
+                            if key != last and key != before:
+                                before, last = last, key
+                                if count == len(out):
+                                    longer = np.zeros(2 * count, np.int64)
+                                    longer[:count] = out
+                                    out = longer
+                                out[count] = key
+                                count += 1
     return out[:count]
 
 
@@ -312,19 +347,23 @@ def _add_to_blocks(
     pixels, stride = image.image, image.stride
     table, weight = scale.table, weights.table
     base, shift, masks = support.base, support.shift, support.mask
-    pinhole = place.camera[0] == 0
-    fx, fy = np.float32(place.camera[1]), np.float32(place.camera[2])
-    cx, cy = np.float32(place.camera[3]), np.float32(place.camera[4])
+    camera = place.camera
+    pinhole = camera[0] == 0
+    lanes = weights.lanes
+    rim = lanes // 2  # pixels that kernels reach out of the image
+    margin = np.float32(rim)
+    fx, fy = np.float32(camera[1]), np.float32(camera[2])
+    cx, cy = np.float32(camera[3]) + margin, np.float32(camera[4]) + margin
+    line_z, line_u, line_v = (
+        np.zeros(SIDE, np.float32), np.zeros(SIDE, np.float32), np.zeros(SIDE, np.float32))
     # offsets within a block are small: float32 holds them
     step_x = np.float32(R[0, 0] * voxel)
     step_y = np.float32(R[1, 0] * voxel)
     step_z = np.float32(R[2, 0] * voxel)
-    lanes = weights.lanes
-    # from a point's pixel, counted from CELL before the image, to its window's first
-    offset = image.pad - CELL - (lanes // 2 - 1)
+    # from a point's pixel, counted from rim before the image, to its window's first
+    offset = image.pad - rim - (lanes // 2 - 1)
     phases = np.float32(len(weight) // lanes)
-    margin = np.float32(CELL)
-    right, bottom = np.float32(place.width + CELL - 1), np.float32(place.height + CELL - 1)
+    right, bottom = np.float32(place.width + 2 * rim - 1), np.float32(place.height + 2 * rim - 1)
     last_row, last_column = masks.shape[0] - 1, masks.shape[1] - 1
     per_metre, deepest = np.float32(scale.per_metre), np.float32(len(table) - 1)
     constant, quadratic = np.float32(scale.constant), np.float32(scale.quadratic)
@@ -341,31 +380,34 @@ def _add_to_blocks(
             y0 = np.float32(R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz + t[1])
             z0 = np.float32(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + t[2])
             first_voxel = int64(block) * VOXELS + line * SIDE
-            for i in range(SIDE):
+            for i in range(SIDE):  # a loop of its own, as it is one vector operation
+                n = uint64(i)
                 along = np.float32(i)
-                z = z0 + along * step_z
+                line_z[n] = z0 + along * step_z
+                closeness = np.float32(1) / line_z[n]
+                line_u[n] = fx * (x0 + along * step_x) * closeness + cx
+                line_v[n] = fy * (y0 + along * step_y) * closeness + cy
+            for i in range(SIDE):
+                z = line_z[i]
                 depth_at = z * per_metre
                 if not np.float32(0) < depth_at < deepest:
                     continue
-                if pinhole:
-                    closeness = np.float32(1) / z
-                    u = fx * (x0 + along * step_x) * closeness + cx
-                    v = fy * (y0 + along * step_y) * closeness + cy
-                else:
-                    seen, u64, _, _, v64, _, _ = project_jet(
-                        place.camera, float(x0 + along * step_x), 0.0,
+                # (margin is in cx, cy already)
+                u_up, v_up = line_u[i], line_v[i]
+                if not pinhole:
+                    along = np.float32(i)
+                    seen, u, _, _, v, _, _ = project_jet(
+                        camera, float(x0 + along * step_x), 0.0,
                         float(y0 + along * step_y), 0.0, float(z), 0.0)
                     if not seen:
                         continue
-                    u, v = np.float32(u64), np.float32(v64)
+                    u_up, v_up = np.float32(u) + margin, np.float32(v) + margin
                 # truncation is floor, as these are positive
-                u_up, v_up = u + margin, v + margin
-                if not (np.float32(0) <= u_up and np.float32(0) <= v_up
-                        and u < right and v < bottom):
+                if not (np.float32(0) <= u_up < right and np.float32(0) <= v_up < bottom):
                     continue
                 u_whole, v_whole = int(u_up), int(v_up)
-                row = min(max(v_whole - CELL, 0) // CELL, last_row)
-                column = min(max(u_whole - CELL, 0) // CELL, last_column)
+                row = min(max(v_whole - rim, 0) >> _CELL_BITS, last_row)
+                column = min(max(u_whole - rim, 0) >> _CELL_BITS, last_column)
                 mask = masks[row, column]
                 if mask == uint64(0):
                     continue

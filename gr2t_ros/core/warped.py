@@ -26,10 +26,10 @@ INVALID = np.float32(1e9)
 _SQRT32 = sqrt(32.0)
 _PHASES = 256  # sub-pixel positions with weights of their own
 _HALF_WIDTH = 2.6  # bandwidths; beyond, the weights are folded into the moments
-_SAMPLES = 8192  # of t(z)
+_SAMPLES = 8192  # of t(z), which goes on some way beyond depth_max
+_BEYOND = 1.1
 CELL = 4  # px; side of the squares that know their support
-_MARGIN = 3  # px about a cell whose depths it knows
-SUPPORT = 3.5  # bandwidths along the depth at which a kernel ends
+SUPPORT = 3.0  # bandwidths along the depth at which a kernel ends
 BINS = 2.0  # a bandwidth; resolution of the support
 _UNWARP = np.float32(BINS * _SQRT32)
 _OUTLIER = np.float32(0.2)  # less than this share of the window's best density makes an outlier
@@ -56,7 +56,7 @@ class Scale(NamedTuple):
         cls, constant: float, quadratic: float, floor: float, depth_max: float
     ) -> Scale:
         """Tabulate; depths above depth_max (metres) count as invalid."""
-        z = np.linspace(0, 1.1 * depth_max, _SAMPLES)
+        z = np.linspace(0, _BEYOND * depth_max, _SAMPLES)
         slope = 1 / np.maximum(constant + quadratic * z * z, floor)
         steps = np.diff(z) * (slope[1:] + slope[:-1]) / 2
         t = np.concatenate([[0.0], np.cumsum(steps)])
@@ -135,7 +135,7 @@ class Support(NamedTuple):
 def warped(view: View, scale: Scale, weights: Weights) -> Warped:
     """Return a view's depth image in units of its bandwidth."""
     height, width = view.depth.shape
-    pad = weights.lanes + _MARGIN + CELL
+    pad = 2 * weights.lanes + CELL
     image = np.full((height + 2 * pad, width + 2 * pad), INVALID)
     bins = np.full((height, width), -1, np.int32)
     # without a ray a pixel has no place in space
@@ -150,12 +150,12 @@ def warped(view: View, scale: Scale, weights: Weights) -> Warped:
 def _warp(
     depth: Floats, scale: Scale, pad: int, image: Floats, bins: NDArray[np.int32]
 ) -> None:
-    last = np.float32(len(scale.table) - 1)
+    last = np.float32((len(scale.table) - 1) / _BEYOND * 1.00001)
     per_metre = np.float32(scale.per_metre)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             at = depth[v, u] * per_metre
-            if np.float32(0) < at < last:
+            if np.float32(0) < at <= last:
                 i = int(at)
                 t = scale.table[i] + (at - np.float32(i)) * (scale.table[i + 1] - scale.table[i])
                 image[v + pad, u + pad] = t
@@ -170,22 +170,49 @@ def empty_support(height: int, width: int) -> Support:
 
 
 @njit(cache=True, nogil=True)
-def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int) -> None:
-    """Fill in the support of rows of cells, from first to end."""
-    base_of, shift_of, mask_of = support.base, support.shift, support.mask
+def depth_ranges(
+    bins: NDArray[np.int32],
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Return the least and the largest bin within each cell; 2^30 and -1 where there is none."""
     height, width = bins.shape
+    rows, columns = -(-height // CELL), -(-width // CELL)
+    low = np.full((rows, columns), 2 ** 30, np.int32)
+    high = np.full((rows, columns), -1, np.int32)
+    for v in range(height):
+        j = v // CELL
+        for u in range(width):
+            b = bins[v, u]
+            if b >= 0:
+                i = u // CELL
+                low[j, i] = min(low[j, i], b)
+                high[j, i] = max(high[j, i], b)
+    return low, high
+
+
+@njit(cache=True, nogil=True)
+def find_support(
+    bins: NDArray[np.int32], low_of: NDArray[np.int32], high_of: NDArray[np.int32], lanes: int,
+    support: Support, first: int, end: int,
+) -> None:
+    """
+    Fill in the support of rows of cells, from first to end.
+
+    :param low_of: from depth_ranges, as high_of
+    :param lanes: of the weights: a pixel counts for points half of that away
+    """
+    base_of, shift_of, mask_of = support.base, support.shift, support.mask
+    rows, columns = mask_of.shape
+    height, width = bins.shape
+    margin = lanes // 2
+    about = -(-margin // CELL)
     reach = int(np.ceil(SUPPORT * BINS))
     for j in range(first, end):
-        top, bottom = max(CELL * j - _MARGIN, 0), min(CELL * (j + 1) + _MARGIN, height)
-        for i in range(mask_of.shape[1]):
-            left, right = max(CELL * i - _MARGIN, 0), min(CELL * (i + 1) + _MARGIN, width)
+        for i in range(columns):
             low, high = 2 ** 30, -1
-            for v in range(top, bottom):
-                for u in range(left, right):
-                    b = bins[v, u]
-                    if b >= 0:
-                        low = min(low, b)
-                        high = max(high, b)
+            for row in range(max(j - about, 0), min(j + about + 1, rows)):
+                for column in range(max(i - about, 0), min(i + about + 1, columns)):
+                    low = min(low, low_of[row, column])
+                    high = max(high, high_of[row, column])
             mask_of[j, i] = uint64(0)
             if high < 0:
                 continue
@@ -199,8 +226,8 @@ def find_support(bins: NDArray[np.int32], support: Support, first: int, end: int
                 # one surface: no gap that a bin would show
                 mask = (uint64(2) << uint64(span >> shift)) - uint64(1)
             else:
-                for v in range(top, bottom):
-                    for u in range(left, right):
+                for v in range(max(CELL * j - margin, 0), min(CELL * (j + 1) + margin, height)):
+                    for u in range(max(CELL * i - margin, 0), min(CELL * (i + 1) + margin, width)):
                         b = bins[v, u]
                         if b >= 0:
                             a = uint64((b - reach - base) >> shift)

@@ -162,9 +162,9 @@ def _check(path: Path) -> None:
     if path.is_dir():
         if not (path / 'metadata.yaml').is_file():
             inside = sorted(item for item in path.iterdir() if item.suffix in _FILES)
-            hint = (f'name the files inside instead: {" ".join(map(str, inside))}' if inside
-                    else 'and holds no .bag, .mcap or .db3 file')
-            raise InputError(f'{path} is no rosbag2 folder: it has no metadata.yaml; {hint}')
+            hint = (f'; name the files inside instead: {" ".join(map(str, inside))}' if inside
+                    else ' and no .bag, .mcap or .db3 file')
+            raise InputError(f'{path} is no rosbag2 folder: it has no metadata.yaml{hint}')
     elif path.suffix not in _FILES:
         raise InputError(
             f'{path} is not a bag: .bag, .mcap and .db3 files and rosbag2 folders can be read')
@@ -173,7 +173,9 @@ def _check(path: Path) -> None:
 def _repair(path: Path) -> str:
     if path.suffix == '.bag':
         return '`rosbag reindex`'
-    return '`mcap recover`' if path.suffix == '.mcap' else '`ros2 bag reindex`'
+    if path.suffix == '.mcap' or any(path.glob('*.mcap')):
+        return '`mcap recover`'
+    return '`ros2 bag reindex`'
 
 
 def _reason(error: Exception) -> str:

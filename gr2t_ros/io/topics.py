@@ -325,8 +325,8 @@ def _given(bag: Bag, name: str, kinds: Sequence[str], option: str) -> Topic:
 
 def _options(problem: str, option: str, topics: Iterable[Topic]) -> str:
     """Return a sentence with options to copy, a line each."""
-    lines = [f'{problem}; add']
-    lines += [f'  {option} {topic.name}' for topic in topics]
+    lines = [f'  {option} {topic.name}' for topic in topics]
+    lines.insert(0, f'{problem}; add one of' if len(lines) > 1 else f'{problem}; add')
     return '\n'.join(lines)
 
 

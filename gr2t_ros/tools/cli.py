@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+import difflib
 from importlib import import_module, metadata
 import os
 import sys
@@ -31,6 +32,17 @@ _COMMANDS = {
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise InputError(f'{message}; see {self.prog} --help')
+
+    def parse_known_args(  # type: ignore[override]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None,
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Refuse what is unknown here, where the command's own options are known."""
+        found, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            near = difflib.get_close_matches(unknown[0], self._option_string_actions, n=1)
+            hint = f' (did you mean {near[0]}?)' if near else ''
+            self.error(f'unknown argument {" ".join(unknown)}{hint}')
+        return found, unknown
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -81,7 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the true surface, likewise, in the same frame and unit; or the word tabletop')
     parser.add_argument(
         '--threshold', metavar='M', type=float, action='append',
-        help='a distance for completeness and F-score; may be repeated (0.001 and 0.002)')
+        help='a distance for precision, completeness (of all of the reference, also of what no '
+        'camera saw) and F-score; may be repeated (0.001 and 0.002)')
     parser.add_argument('--json', action='store_true', help='print JSON instead of a table')
 
 

@@ -20,7 +20,8 @@ _OF_EVERY_NODE = ('use_sim_time', 'qos_overrides', 'start_type_description_servi
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add --preset, --params and -p."""
-    group = parser.add_argument_group('parameters')
+    group = parser.add_argument_group(
+        'parameters', 'config/gr2t.yaml in the share folder lists all, with ranges and defaults')
     group.add_argument(
         '--preset', metavar='NAME', help='parameters for a sensor: a file of the share folder '
         'config/, such as tabletop_scan')

@@ -272,14 +272,16 @@ def _parameters(settings: Settings) -> str:
 
 
 def _count(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f'must be at least 1, not {number}')
-    return number
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, not {text}')
+    return int(text)
 
 
 def _seconds(text: str) -> float:
-    seconds = float(text)
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = float('nan')
     if not 0 <= seconds < float('inf'):
         raise argparse.ArgumentTypeError(f'must be a time in seconds, not {text}')
     return seconds

@@ -109,13 +109,17 @@ def table(content: Mapping[str, Any], run: Run, results: Mapping[str, str]) -> s
     lines += [f'note     {sentence}' for reason, sentence in run.explanations.items()
               if reason not in frames['dropped']]
     lines += [
-        f'rays     {rays["marched"]} marched, {rays["remarched"]} again, '
-        f'{rays["converged"]} converged',
+        f'rays     {rays["marched"]} marched, {rays["remarched"]} times again; '
+        f'{100 * rays["converged"] / max(rays["marched"] + rays["remarched"], 1):.1f} % converged',
         f'time     {run.loop_seconds:.1f} s: {content["frames_per_second"]:.2f} frames/s, '
-        f'{content["realtime_factor"]:.2f} x real time; start {run.startup_seconds:.1f} s, '
-        f'finish {run.finish_seconds:.1f} s',
+        f'{content["realtime_factor"]:.2f} x real time; besides {run.startup_seconds:.1f} s for '
+        f'the kernels and {run.finish_seconds:.1f} s to finish and write',
         'mean     ' + ', '.join(f'{stage} {timing[stage]["mean"]:.1f} ms' for stage in STAGES),
         f'memory   {content["peak_memory_mb"]:.0f} MB at most']
+    if content['mesh'].get('vertices') == 0:
+        lines.append(
+            'note     the mesh is empty: no ray found a maximum of the likelihood; are the '
+            'poses those of the images, and is depth_bandwidth not far below the noise?')
     if run.input_damage:
         lines.append(f'damage   {run.input_damage}')
     return '\n'.join(lines)

@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise InputError(f'--seed must be 0 or more, not {args.seed}')
     camera = simulated_camera(args.width, args.height, args.focal)
-    scene = None if args.mesh.exists() else SCENES.get(str(args.mesh))
+    scene = None if args.mesh.is_file() else SCENES.get(str(args.mesh))
     mesh = load_mesh(args.mesh)
     stamps: Sequence[int] | None = None
     if args.trajectory:
@@ -131,9 +131,9 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     :param path: a file, or the name of one of SCENES
     :raises InputError: if it cannot be read or has no triangles
     """
-    if not path.exists() and str(path) in SCENES:
-        return SCENES[str(path)].mesh()
     if not path.is_file():
+        if str(path) in SCENES:
+            return SCENES[str(path)].mesh()
         raise InputError(f'there is no mesh {path}')
     try:
         mesh = trimesh.load_mesh(path, process=False)
