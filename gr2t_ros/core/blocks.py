@@ -21,7 +21,7 @@ Floats = NDArray[np.float32]
 SIDE = 8  # voxels
 VOXELS = SIDE ** 3
 COEFFICIENTS = SIDE * SIDE * ROW
-BYTES_PER_BLOCK = 4 * VOXELS + 4 * COEFFICIENTS + 8 + 27 * 4 + 2 * 4
+BYTES_PER_BLOCK = 2 * 4 * VOXELS + 4 * COEFFICIENTS + 8 + 27 * 4 + 2 * 4
 _BITS = 21  # of a block's number on each axis: 2 million blocks either way
 _OFFSET = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
@@ -38,7 +38,8 @@ class Blocks(NamedTuple):
     :param size: number of blocks in use, block 0 included; the arrays may be longer
     :param table_key: (2^k,) int64 of the hash; table_block: (2^k,) int32, 0 where free
     :param key: (n,) int64, each block's place
-    :param value: flat float32, VOXELS a block, x fastest
+    :param value: flat float32, VOXELS a block, x fastest: C times the likelihood
+    :param expected: likewise: C times the peak that the views which see the voxel would give
     :param coefficient: flat float32, COEFFICIENTS a block
     :param neighbour: (n, 27) int32, 0 where there is none
     :param touched: (n,) int32, the last change of the values; filtered: of the coefficients
@@ -49,6 +50,7 @@ class Blocks(NamedTuple):
     table_block: NDArray[np.int32]
     key: NDArray[np.int64]
     value: Floats
+    expected: Floats
     coefficient: Floats
     neighbour: NDArray[np.int32]
     touched: NDArray[np.int32]
@@ -60,7 +62,8 @@ def new_blocks(capacity: int = 1024) -> Blocks:
     table = 4 * capacity
     return Blocks(
         1, np.zeros(table, np.int64), np.zeros(table, np.int32), np.full(capacity, -1, np.int64),
-        np.zeros(capacity * VOXELS, np.float32), np.zeros(capacity * COEFFICIENTS, np.float32),
+        np.zeros(capacity * VOXELS, np.float32), np.zeros(capacity * VOXELS, np.float32),
+        np.zeros(capacity * COEFFICIENTS, np.float32),
         np.zeros((capacity, 27), np.int32), np.zeros(capacity, np.int32),
         np.zeros(capacity, np.int32))
 
@@ -252,3 +255,16 @@ def copy_margins(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
             target = before * COEFFICIENTS + line * ROW + 8
             for x in range(3):
                 blocks.coefficient[target + x] = blocks.coefficient[source + x]
+
+
+@njit(cache=True, nogil=True)
+def values_at(
+    blocks: Blocks, values: Floats, voxels: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return a field's values at whole voxels (n, 3); 0 where there is no block."""
+    out = np.zeros(len(voxels))
+    for n in range(len(voxels)):
+        x, y, z = voxels[n]
+        block = find(blocks.table_key, blocks.table_block, key_of(x >> 3, y >> 3, z >> 3))
+        out[n] = values[block * VOXELS + ((z & 7) * SIDE + (y & 7)) * SIDE + (x & 7)]
+    return out

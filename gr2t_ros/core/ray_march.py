@@ -16,11 +16,12 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exact_density, voxel_density
+from . import exact_density, voxel_query
 from .climb import INTERVAL, Status
 from .exact_density import ExactDensity
 from .view import View
-from .voxel_density import keys_along, VoxelDensity
+from .voxel_density import VoxelDensity
+from .voxel_query import keys_along
 from .warped import robust_starts, Scale, warped, Weights
 
 Doubles = NDArray[np.float64]
@@ -162,7 +163,7 @@ def watched_blocks(
 
 def _kernels(density: Density) -> ModuleType:
     """Return the module whose march_rays and changed_rays take the density's state."""
-    return voxel_density if isinstance(density, VoxelDensity) else exact_density
+    return voxel_query if isinstance(density, VoxelDensity) else exact_density
 
 
 def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None]) -> None:

@@ -1,0 +1,181 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""What the lattice is asked: the density along rays, and whether it changed there."""
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from numba import int64, njit
+import numpy as np
+from numpy.typing import NDArray
+
+from .blocks import Blocks, COEFFICIENTS, find, key_of
+from .climb import aim, climb, h3_at, INTERVAL, MAX_ITERATIONS, set_out, Status
+from .vector import spline_jet
+
+Doubles = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+
+class Lattice(NamedTuple):
+    """
+    The sampled density, for the kernels.
+
+    :param voxel: metres
+    """
+
+    blocks: Blocks
+    voxel: float
+
+
+@njit(inline='always')
+def _jet(
+    coefficient: Floats, neighbour: NDArray[np.int32], table_key: NDArray[np.int64],
+    table_block: NDArray[np.int32], voxel: float, bases: NDArray[np.int64],
+    recent: NDArray[np.int64], origin: Doubles, direction: Doubles, distance: float,
+) -> tuple[float, float, float]:
+    """
+    Evaluate the spline at a point of a world line; all 0 where there is no block.
+
+    The lattice's arrays come one by one: taken out of it in the inner loop, each would be counted
+    as in use, which costs more than the evaluation.
+
+    :param bases: (4,), where the blocks of the last point begin
+    :param recent: (1,), the key of its first block
+    :return: C f, C f', C f''
+    """
+    per_voxel = 1.0 / voxel
+    x = (origin[0] + distance * direction[0]) * per_voxel
+    y = (origin[1] + distance * direction[1]) * per_voxel
+    z = (origin[2] + distance * direction[2]) * per_voxel
+    i, j, k = int64(np.floor(x)), int64(np.floor(y)), int64(np.floor(z))
+    # the first of the four taps is one before
+    key = key_of((i - 1) >> 3, (j - 1) >> 3, (k - 1) >> 3)
+    if key != recent[0]:
+        recent[0] = key
+        block = find(table_key, table_block, key)
+        for n, other in enumerate((13, 16, 22, 25)):  # itself, next in y, in z, in both
+            bases[n] = int64(neighbour[block, other]) * COEFFICIENTS
+    # block 0 holds zeros, so what is not there needs no case of its own
+    f, f1, f2 = spline_jet(
+        coefficient, bases, (i - 1) & 7, (j - 1) & 7, (k - 1) & 7,
+        np.float32(x - i), np.float32(y - j), np.float32(z - k),
+        np.float32(direction[0] * per_voxel), np.float32(direction[1] * per_voxel),
+        np.float32(direction[2] * per_voxel))
+    return np.float64(f), np.float64(f1), np.float64(f2)
+
+
+@njit(cache=True, nogil=True)
+def _changed_since(
+    state: Lattice, origin: Doubles, direction: Doubles, low: float, high: float, change: int
+) -> bool:
+    """Tell whether the spline on a piece of a line changed after a change."""
+    blocks = state.blocks
+    steps = int((high - low) / state.voxel) + 1
+    last = int64(-1)
+    for step in range(steps + 1):
+        key = _key_along(state.voxel, origin, direction, low + (high - low) * step / steps)
+        if key != last:
+            last = key
+            if blocks.filtered[find(blocks.table_key, blocks.table_block, key)] > change:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _key_along(voxel: float, origin: Doubles, direction: Doubles, distance: float) -> np.int64:
+    """Return the key of the block that holds the first spline tap of a point of a line."""
+    per_voxel = 1.0 / voxel
+    i = int64(np.floor((origin[0] + distance * direction[0]) * per_voxel))
+    j = int64(np.floor((origin[1] + distance * direction[1]) * per_voxel))
+    k = int64(np.floor((origin[2] + distance * direction[2]) * per_voxel))
+    return key_of((i - 1) >> 3, (j - 1) >> 3, (k - 1) >> 3)
+
+
+@njit(cache=True, nogil=True)
+def keys_along(
+    state: Lattice, origin: Doubles, directions: Doubles, lows: Doubles, highs: Doubles
+) -> NDArray[np.int64]:
+    """Return the keys of the blocks that pieces of lines need, with repetitions."""
+    out = np.zeros(1024, np.int64)
+    count = 0
+    recent = np.full(4, -1, np.int64)
+    for n in range(len(directions)):
+        steps = int((highs[n] - lows[n]) / state.voxel) + 1
+        for step in range(steps + 1):
+            key = _key_along(
+                state.voxel, origin, directions[n], lows[n] + (highs[n] - lows[n]) * step / steps)
+            if key == recent[0] or key == recent[1] or key == recent[2] or key == recent[3]:
+                continue
+            recent[count % 4] = key
+            if count == len(out):
+                longer = np.zeros(2 * count, np.int64)
+                longer[:count] = out
+                out = longer
+            out[count] = key
+            count += 1
+    return out[:count]
+
+
+@njit(cache=True, nogil=True)
+def jets(
+    state: Lattice, origins: Doubles, directions: Doubles, distances: Doubles, out: Doubles
+) -> None:
+    """Write the jets of lines to out (n, 3); one direction and distance may serve all."""
+    bases, recent = np.zeros(4, np.int64), np.full(1, -1, np.int64)
+    coefficient, neighbour = state.blocks.coefficient, state.blocks.neighbour
+    table_key, table_block = state.blocks.table_key, state.blocks.table_block
+    for n in range(len(origins)):
+        m = min(n, len(directions) - 1)
+        f, f1, f2 = _jet(
+            coefficient, neighbour, table_key, table_block, state.voxel, bases, recent,
+            origins[n], directions[m], distances[m])
+        out[n, 0], out[n, 1], out[n, 2] = f, f1, f2
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def march_rays(
+    state: Lattice, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
+    pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,
+    depths: Floats, totals: Floats, statuses: NDArray[np.uint8], counts: NDArray[np.uint8],
+) -> None:
+    """Climb from the starts of chosen rays; see ray_march.Rays for the arrays."""
+    bases, recent = np.zeros(4, np.int64), np.full(1, -1, np.int64)
+    coefficient, neighbour = state.blocks.coefficient, state.blocks.neighbour
+    table_key, table_block = state.blocks.table_key, state.blocks.table_block
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in chosen:
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        h3 = h3_at(bandwidth, start)
+        ray = set_out(start)
+        count = 0
+        while ray.status == 0 and count < MAX_ITERATIONS:
+            f, f1, f2 = _jet(
+                coefficient, neighbour, table_key, table_block, state.voxel, bases, recent,
+                origin, direction, ray.target)
+            # the mean-shift's g, as on a surface that faces its cameras
+            ray = climb(ray, start, h3, f, f1, f2, f / (h3 * h3))
+            count += 1
+        depths[i] = ray.beta
+        totals[i] = ray.value
+        statuses[i] = ray.status if ray.status != 0 else Status.ITERATION_LIMIT
+        counts[i] = count
+
+
+@njit(cache=True, nogil=True)
+def changed_rays(
+    state: Lattice, bandwidth: tuple[float, float, float], pixels: NDArray[np.int32],
+    table: Doubles, T_world_camera: Doubles, starts: Floats, marched: NDArray[np.int32],
+    out: NDArray[np.bool_],
+) -> None:
+    """Tell of each ray whether the density in its interval changed since it was marched."""
+    origin = T_world_camera[:3, 3].copy()
+    direction = np.zeros(3)
+    for i in range(len(pixels)):
+        aim(table, T_world_camera, pixels[i], direction)
+        start = np.float64(starts[i])
+        reach = INTERVAL * h3_at(bandwidth, start)
+        out[i] = marched[i] < 0 or _changed_since(
+            state, origin, direction, start - reach, start + reach, marched[i])
