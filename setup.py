@@ -32,7 +32,7 @@ setup(
     entry_points={
         'console_scripts': [
             'gr2t = gr2t_ros.tools.cli:main',
-            'gr2t_node = gr2t_ros.ros.node:main',
+            'gr2t_node = gr2t_ros.ros:main',
         ],
     },
     # The lower bounds let it run on the numpy 1 that humble and jazzy are built with.

@@ -161,7 +161,7 @@ def test_wheel_holds_all(tmp_path: Path) -> None:
     modules = {file.relative_to(ROOT) for file in (ROOT / 'gr2t_ros').rglob('*.py')}
     assert all((tmp_path / 'wheel' / module).is_file() for module in modules)
     info, = (tmp_path / 'wheel').glob('*.dist-info')
-    assert 'gr2t_node = gr2t_ros.ros.node:main' in (info / 'entry_points.txt').read_text()
+    assert 'gr2t_node = gr2t_ros.ros:main' in (info / 'entry_points.txt').read_text()
 
 
 def test_colcon_builds_and_tests_it(tmp_path: Path) -> None:
