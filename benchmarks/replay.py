@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import fields
 from itertools import islice
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from common import found, KITCHEN_SWEEP, recorded, table
+from common import found, frames, recorded, table
 import numpy as np
+from stages import DEPTH_MAX, VOXELS
 
 from gr2t_ros.core.blocks import BYTES_PER_BLOCK
+from gr2t_ros.core.ray_march import Rays
 from gr2t_ros.core.reconstruction import Reconstruction, Update, warm_up
 from gr2t_ros.core.view import View
 from gr2t_ros.core.view_mesh import ViewMesh
@@ -44,21 +47,15 @@ def measure_replay(data: Path, name: str, every: bool, count: int | None) -> dic
         last = reconstruction.finish()
         finish = perf_counter() - began
         peak = peak_memory_mb()
-        density = reconstruction.density
-        assert isinstance(density, VoxelDensity)
-        blocks = density.blocks.size - 1
-        bytes_of_rays = sum(
-            array.nbytes for keyframe in reconstruction.keyframes for array in (
-                keyframe.rays.pixels, keyframe.rays.start, keyframe.rays.depth,
-                keyframe.rays.total, keyframe.rays.status, keyframe.rays.iterations,
-                keyframe.rays.marched))
-        rays = sum(len(keyframe.rays.pixels) for keyframe in reconstruction.keyframes)
-        keyframes = len(reconstruction.keyframes)
+        blocks = _blocks(reconstruction)
+        keyframes = reconstruction.keyframes
+        rays = sum(len(keyframe.rays.pixels) for keyframe in keyframes)
+        bytes_of_rays = sum(_bytes_of_rays(keyframe.rays) for keyframe in keyframes)
     frame_ms = 1e3 * np.sum([seconds[stage] for stage in _STAGES], axis=0)
     quarter = len(frame_ms) // 4
     row: dict[str, Any] = {
         'data': name + (', all keyframes' if every else ''), 'frames': len(frame_ms),
-        'keyframes': keyframes, 'frames/s': len(frame_ms) / loop,
+        'keyframes': len(keyframes), 'frames/s': len(frame_ms) / loop,
         'p50 ms': float(np.median(frame_ms)), 'p95 ms': float(np.percentile(frame_ms, 95)),
         **{f'{stage} %': 100 * float(np.sum(seconds[stage])) / loop for stage in _STAGES},
         'finish s': finish,
@@ -97,29 +94,39 @@ def _loop(
         seconds['again'].append((1 - new) * update.seconds['march'])
 
 
-def measure_blocks(data: Path, frames: int) -> list[dict[str, Any]]:
-    """Print and return how many blocks a square metre of surface takes."""
+def measure_blocks(data: Path) -> list[dict[str, Any]]:
+    """Print and return how many blocks a square metre of surface takes, with h3 = voxel size."""
     rows = []
-    path = found(data, KITCHEN_SWEEP)
-    views = list(islice(recorded(path, Settings(depth_max=3.5)), frames)) if path else []
-    for voxel_size in (0.005, 0.01, 0.02) if views else ():
-        # h3 = voxel size; one view at a time, for the area of many views overlaps
-        settings = Settings(
-            depth_bandwidth=voxel_size, depth_bandwidth_quadratic=0.0, voxel_size=voxel_size,
-            depth_max=3.5)
-        found_blocks = []
-        for view in views[::max(len(views) // 5, 1)]:
-            with closing(Reconstruction(settings)) as reconstruction:
-                reconstruction.add(view)
-                density = reconstruction.density
-                assert isinstance(density, VoxelDensity)
-                found_blocks.append((density.blocks.size - 1) / _area(reconstruction.mesh(0)))
-        blocks = float(np.median(found_blocks))
-        rows.append({
-            'voxel mm': 1e3 * voxel_size, 'blocks/m2': blocks,
-            'MB/m2': 1e-6 * blocks * BYTES_PER_BLOCK})
-    table(f'{KITCHEN_SWEEP}: blocks of a square metre of one view\'s mesh, h3 = voxel', rows)
+    for name, voxels in VOXELS.items():
+        # one view at a time, for the areas of several overlap
+        views = frames(data, name, 10, Settings(depth_max=DEPTH_MAX))[::3]
+        for voxel_size in voxels if views else ():
+            settings = Settings(
+                depth_bandwidth=voxel_size, depth_bandwidth_quadratic=0.0, voxel_size=voxel_size,
+                depth_max=DEPTH_MAX)
+            shares = []
+            for view in views:
+                with closing(Reconstruction(settings)) as reconstruction:
+                    reconstruction.add(view)
+                    shares.append(_blocks(reconstruction) / _area(reconstruction.mesh(0)))
+            per_area = float(np.median(shares))
+            rows.append({
+                'data': name, 'voxel mm': 1e3 * voxel_size, 'blocks/m2': per_area,
+                'MB/m2': 1e-6 * per_area * BYTES_PER_BLOCK})
+    table('blocks of a square metre of one view\'s mesh', rows)
     return rows
+
+
+def _blocks(reconstruction: Reconstruction) -> int:
+    """Return the number of blocks; the first stands for none."""
+    assert isinstance(reconstruction.density, VoxelDensity)
+    return reconstruction.density.blocks.size - 1
+
+
+def _bytes_of_rays(rays: Rays) -> int:
+    """Return the memory of all that is kept for each ray."""
+    own = (getattr(rays, item.name) for item in fields(rays))
+    return sum(array.nbytes for array in own if array.shape == rays.pixels.shape)
 
 
 def _area(mesh: ViewMesh) -> float:

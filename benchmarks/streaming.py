@@ -62,7 +62,7 @@ def replay(data: Path, quick: bool) -> object:
             in_fresh_process(cores(), measure_replay, data, name, every, count)
             for name, every in (
                 (KITCHEN_30HZ, False), (KITCHEN_SWEEP, False), (KITCHEN_SWEEP, True))],
-        'blocks': in_fresh_process(cores(), measure_blocks, data, count or 100)}
+        'blocks': in_fresh_process(cores(), measure_blocks, data)}
 
 
 def accuracy(data: Path, quick: bool) -> object:

@@ -19,6 +19,7 @@ MODELS = ('plumb_bob', 'rational_polynomial', 'equidistant')
 _COEFFICIENTS = {'plumb_bob': 5, 'rational_polynomial': 8, 'equidistant': 4}
 _PINHOLE, _RADIAL, _EQUIDISTANT = 0.0, 1.0, 2.0
 _MAX_ROUND_TRIP = 0.05  # px; pixels that the model cannot invert better have no ray
+_MAX_SLOPE = 10.0  # of a ray against the optical axis, 84 degrees: no depth image goes farther
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class Camera:
         Return the rays of all pixels.
 
         :return: (h, w, 2) float64: the point of pixel (u, v) at depth z is z (a, b, 1), with
-            a, b = rays[v, u]; NaN where the distortion cannot be inverted
+            a, b = rays[v, u]; NaN where the distortion cannot be inverted or the ray is too steep
         """
         v, u = np.mgrid[0:self.height, 0:self.width].astype(np.float64)
         rays: NDArray[np.float64] = np.stack(
@@ -127,7 +128,8 @@ class Camera:
             again = _project(self._vector(np.inf), points.reshape(-1, 3)).reshape(rays.shape)
             with np.errstate(invalid='ignore'):
                 error = np.abs(again - np.stack([u, v], axis=-1)).max(axis=-1)
-                rays[~(error < _MAX_ROUND_TRIP)] = np.nan
+                steep = np.abs(rays).max(axis=-1) > _MAX_SLOPE
+                rays[~(error < _MAX_ROUND_TRIP) | steep] = np.nan
         rays.flags.writeable = False
         return rays
 

@@ -149,7 +149,8 @@ def _wait_for_subscriber(node: Node, publishers: Iterable[Publisher], seconds: f
     Wait until someone subscribes to images, reliably if possible; in vain at most so long.
 
     A node may subscribe at best effort first and change once it sees that the publisher is
-    reliable; a recording that starts before that loses its first images.
+    reliable; and its subscription to one topic may be found before that to another. A recording
+    that starts before all are found loses its first images, or their transforms.
     """
     publishers = list(publishers)
     images = [item for item in publishers if item.msg_type in map(_message_type, _IMAGES)]
@@ -163,7 +164,10 @@ def _wait_for_subscriber(node: Node, publishers: Iterable[Publisher], seconds: f
                 info.qos_profile.reliability == ReliabilityPolicy.RELIABLE
                 for item in heard
                 for info in node.get_subscriptions_info_by_topic(item.topic_name))
-            if reliable or time.monotonic() - matched > _RELIABLE_AFTER:
+            unmatched = [
+                item for item in publishers
+                if node.count_subscribers(item.topic_name) > item.get_subscription_count()]
+            if (reliable and not unmatched) or time.monotonic() - matched > _RELIABLE_AFTER:
                 return
         time.sleep(_POLL)
     tqdm.write(
