@@ -151,13 +151,15 @@ def watched_blocks(
     density: VoxelDensity, rays: Rays, pool: Executor | None = None
 ) -> NDArray[np.int32]:
     """Return the lattice's blocks that the rays' search intervals need, each once."""
-    keys: list[NDArray[np.int64]] = []
-    for begin in range(0, len(rays.pixels), 16 * _CHUNK):
-        part = slice(begin, begin + 16 * _CHUNK)
+    keys = [np.zeros(0, np.int64)] * -(-len(rays.pixels) // _CHUNK)
+
+    def find(part: slice) -> None:
         start = rays.start[part].astype(np.float64)
         reach = INTERVAL * density.h3(start)
-        keys.append(keys_along(
-            density.state, rays.origin, rays.directions(part), start - reach, start + reach))
+        keys[part.start // _CHUNK] = keys_along(
+            density.state, rays.origin, rays.directions(part), start - reach, start + reach)
+
+    _over_chunks(pool, len(rays.pixels), find)
     return density.cover(np.concatenate(keys) if keys else np.zeros(0, np.int64))
 
 

@@ -200,7 +200,7 @@ class Reconstruction:
             self.density, view, self.settings.ray_stride, self.settings.start, self._pool)
         blocks = None
         if isinstance(self.density, VoxelDensity):
-            blocks = watched_blocks(self.density, rays)
+            blocks = watched_blocks(self.density, rays, self._pool)
         return Keyframe(view, rays, blocks)
 
     def _is_keyframe(self, view: View) -> bool:
