@@ -197,7 +197,7 @@ def test_views_that_cannot_be_added_say_why():
     voxels.add(empty)
     assert voxels.blocks.size == 1
     away = plane_view(CAMERA, pose([0, 0, 0], [9e3, 0, 0]), [0, 0, 1], 0.8)
-    with pytest.raises(FrameError, match='9000 m from the origin.*a map reaches 8389 m'):
+    with pytest.raises(FrameError, match=r'9000 m from the origin.*a map reaches 8389 m'):
         voxels.add(away)
 
 
