@@ -81,6 +81,9 @@ def climb(
     beta = ray.target
     if value <= 0:
         return Climber(3, beta, beta, value, first, second, g, False, 0.5)
+    if ray.value > 0 and ray.first * first < 0 and abs(beta - ray.beta) <= _TOLERANCE * h3:
+        # the maximum is in between: f' may jump there, and then no step gets shorter
+        return Climber(1, beta, beta, value, first, second, g, False, 0.5)
     newton = second < 0
     stretch = 0.5 if newton else 2.0 * ray.stretch
     step = -first / second if newton else stretch * first / g
