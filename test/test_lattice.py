@@ -148,7 +148,7 @@ def test_no_support_is_missed():
 
 def test_blocks_are_found_again_after_growing():
     rng = np.random.default_rng(1)
-    places = [*rng.integers(-30, 30, (6000, 3)), 5, -100000, 900000]
+    places = rng.integers(-30, 30, (6000, 3)) + np.array([5, -100_000, 900_000])
     keys = np.array([lattice.key_of(*place) for place in places])
     blocks = lattice.new_blocks(16)
     for change, part in enumerate(np.array_split(keys, 7)):
