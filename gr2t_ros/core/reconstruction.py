@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError
 from ..settings import Settings
+from .blocks import new_blocks, with_keys
 from .camera import Camera
 from .exact_density import ExactDensity
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
@@ -272,7 +273,9 @@ class Reconstruction:
         if not isinstance(density, VoxelDensity) or (
                 density.aliased_pixels <= _ALIASED * density.pixels):
             return []
-        near = float(np.nanpercentile(view.depth, 5)) if np.isfinite(view.depth).any() else 0
+        if not np.isfinite(view.depth).any():
+            return []
+        near = float(np.nanpercentile(view.depth, 5))
         fitting = density.finest_voxel(near, view.camera)
         return self._once(
             'aliasing', f'{density.aliased_pixels / density.pixels:.0%} of the pixels are too '
@@ -310,4 +313,5 @@ def warm_up(settings: Settings) -> float:
     for _ in tiny.meshes():
         pass
     tiny.close()
+    with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
     return perf_counter() - began

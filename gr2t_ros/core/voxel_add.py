@@ -56,8 +56,9 @@ def keys_of_view(
     Return the keys of the blocks that some rows of cells have support in, with repetitions.
 
     A ray in the middle of each cell is followed through the runs of its mask, in steps that miss
-    no block by more than a corner. More rays are where a cell is wide against a block, where some
-    of its pixels have no ray, and at the border, where kernels reach rim pixels out of the image.
+    no block by more than a corner. More rays are where a cell, or a pixel, is wide against a
+    block, where some pixels have no ray, and at the border, where kernels reach rim pixels out of
+    the image.
     """
     out = np.zeros(4096, np.int64)
     count = 0
@@ -72,6 +73,7 @@ def keys_of_view(
             u0, v0, u1, v1 = CELL * i, CELL * j, CELL * (i + 1), CELL * (j + 1)
             a, b = _ray(rays, u0, v0)
             c, d = _ray(rays, u1, v1)
+            pixel_a, pixel_b = (c - a) / CELL, (d - b) / CELL
             spread = abs(c - a) + abs(d - b)
             inside = 0 < i < columns - 1 and 0 < j < rows - 1 and np.isfinite(
                 spread + _ray(rays, u0, v1)[0] + _ray(rays, u1, v0)[0])
@@ -87,20 +89,27 @@ def keys_of_view(
                 near = depth_of_bins[min(max(base + (start << shift), 0), top)]
                 far = depth_of_bins[min(max(base + (bit << shift), 0), top)]
                 steps = int(2.5 * (far - near) / block_size) + 1
-                stride = 1
+                stride, lines = 1, 1
                 if spread * far <= block_size:
                     stride = CELL if inside else 2
+                elif inside and spread * far > CELL * block_size:
+                    # pixels wider than blocks: several lines each
+                    lines = int(spread * far / (CELL * block_size)) + 1
                 for v in range(v0 + stride // 2 - rim * (j == 0), v1 + rim * (j == rows - 1),
                                stride):
                     for u in range(u0 + stride // 2 - rim * (i == 0),
                                    u1 + rim * (i == columns - 1), stride):
-                        a, b = _ray(rays, u, v)
-                        if not abs(a + b) < np.inf:
+                        middle_a, middle_b = _ray(rays, u, v)
+                        if not abs(middle_a + middle_b) < np.inf:
                             continue
-                        x = R[0, 0] * a + R[0, 1] * b + R[0, 2]
-                        y = R[1, 0] * a + R[1, 1] * b + R[1, 2]
-                        z = R[2, 0] * a + R[2, 1] * b + R[2, 2]
-                        for step in range(steps + 1):
+                        for sample in range(lines * lines * (steps + 1)):
+                            line, step = divmod(sample, steps + 1)
+                            row, column = divmod(line, lines)
+                            a = middle_a + ((column + 0.5) / lines - 0.5) * pixel_a
+                            b = middle_b + ((row + 0.5) / lines - 0.5) * pixel_b
+                            x = R[0, 0] * a + R[0, 1] * b + R[0, 2]
+                            y = R[1, 0] * a + R[1, 1] * b + R[1, 2]
+                            z = R[2, 0] * a + R[2, 1] * b + R[2, 2]
                             depth = near + (far - near) * step / steps
                             key = key_of(
                                 int(np.floor((t[0] + depth * x) / block_size)),
