@@ -53,6 +53,21 @@ def test_incremental_equals_batch(views, settings):
 
 
 @pytest.mark.parametrize('settings', [SETTINGS, EXACT], ids=['voxel', 'exact'])
+def test_what_appears_beside_a_surface_is_seen_by_its_rays(settings):
+    """A later view fills the end of the search interval, where nothing was before."""
+    camera = Camera(40, 30, 80.0, 80.0, 19.5, 14.5)
+    h3 = 0.005
+    views = [
+        plane_view(camera, np.eye(4), [0, 0, 1], 0.5 + offset * h3) for offset in (0, 4.5, -40, 6)]
+    incremental, updates = run(views, settings.updated({'remarch_budget': 60.0}))
+    batch, _ = run(views, settings.updated({'remarch_budget': 0.0}))
+    for a, b in zip(rays_of(incremental), rays_of(batch)):
+        np.testing.assert_array_equal(a, b)
+    assert updates[1].remarched == 1200 and updates[1].changed == (1, 0)
+    assert updates[2].remarched == 0 and updates[2].changed == (2,)
+
+
+@pytest.mark.parametrize('settings', [SETTINGS, EXACT], ids=['voxel', 'exact'])
 def test_one_thread_equals_four(settings):
     for a, b in zip(*(rays_of(run(orbit(4), settings.updated({'threads': n}))[0])
                       for n in (1, 4))):

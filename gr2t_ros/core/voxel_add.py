@@ -73,7 +73,6 @@ def keys_of_view(
             u0, v0, u1, v1 = CELL * i, CELL * j, CELL * (i + 1), CELL * (j + 1)
             a, b = _ray(rays, u0, v0)
             c, d = _ray(rays, u1, v1)
-            pixel_a, pixel_b = (c - a) / CELL, (d - b) / CELL
             spread = abs(c - a) + abs(d - b)
             inside = 0 < i < columns - 1 and 0 < j < rows - 1 and np.isfinite(
                 spread + _ray(rays, u0, v1)[0] + _ray(rays, u1, v0)[0])
@@ -89,12 +88,13 @@ def keys_of_view(
                 near = depth_of_bins[min(max(base + (start << shift), 0), top)]
                 far = depth_of_bins[min(max(base + (bit << shift), 0), top)]
                 steps = int(2.5 * (far - near) / block_size) + 1
-                stride, lines = 1, 1
+                stride, lines, pixel_a, pixel_b = 1, 1, 0.0, 0.0
                 if spread * far <= block_size:
                     stride = CELL if inside else 2
                 elif inside and spread * far > CELL * block_size:
                     # pixels wider than blocks: several lines each
                     lines = int(spread * far / (CELL * block_size)) + 1
+                    pixel_a, pixel_b = (c - a) / CELL, (d - b) / CELL
                 for v in range(v0 + stride // 2 - rim * (j == 0), v1 + rim * (j == rows - 1),
                                stride):
                     for u in range(u0 + stride // 2 - rim * (i == 0),
@@ -105,11 +105,11 @@ def keys_of_view(
                         for sample in range(lines * lines * (steps + 1)):
                             line, step = divmod(sample, steps + 1)
                             row, column = divmod(line, lines)
-                            a = middle_a + ((column + 0.5) / lines - 0.5) * pixel_a
-                            b = middle_b + ((row + 0.5) / lines - 0.5) * pixel_b
-                            x = R[0, 0] * a + R[0, 1] * b + R[0, 2]
-                            y = R[1, 0] * a + R[1, 1] * b + R[1, 2]
-                            z = R[2, 0] * a + R[2, 1] * b + R[2, 2]
+                            p = middle_a + ((column + 0.5) / lines - 0.5) * pixel_a
+                            q = middle_b + ((row + 0.5) / lines - 0.5) * pixel_b
+                            x = R[0, 0] * p + R[0, 1] * q + R[0, 2]
+                            y = R[1, 0] * p + R[1, 1] * q + R[1, 2]
+                            z = R[2, 0] * p + R[2, 1] * q + R[2, 2]
                             depth = near + (far - near) * step / steps
                             key = key_of(
                                 int(np.floor((t[0] + depth * x) / block_size)),
