@@ -106,6 +106,16 @@ def key_of(x: Any, y: Any, z: Any) -> np.int64:
 
 
 @njit(cache=True, nogil=True)
+def with_room(keys: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Return the keys with room behind the first count, doubled where there is none."""
+    if count < len(keys):
+        return keys
+    longer = np.zeros(2 * count, np.int64)
+    longer[:count] = keys
+    return longer
+
+
+@njit(cache=True, nogil=True)
 def place_of(key: np.int64) -> tuple[np.int64, np.int64, np.int64]:
     """Return the block numbers (x, y, z) of a key."""
     return (

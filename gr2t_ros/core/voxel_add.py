@@ -10,7 +10,7 @@ from numba import int64, njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
-from .blocks import Blocks, key_of, place_of, SIDE, VOXELS
+from .blocks import Blocks, key_of, place_of, SIDE, VOXELS, with_room
 from .camera import project_jet
 from .vector import LANES, window_strip
 from .warped import BINS, CELL, Scale, Support, Warped, Weights
@@ -117,10 +117,7 @@ def keys_of_view(
                                 int(np.floor((t[2] + depth * z) / block_size)))
                             if key != last and key != before:
                                 before, last = last, key
-                                if count == len(out):
-                                    longer = np.zeros(2 * count, np.int64)
-                                    longer[:count] = out
-                                    out = longer
+                                out = with_room(out, count)
                                 out[count] = key
                                 count += 1
     return out[:count]

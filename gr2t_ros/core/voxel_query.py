@@ -9,7 +9,7 @@ from numba import int64, njit
 import numpy as np
 from numpy.typing import NDArray
 
-from .blocks import Blocks, COEFFICIENTS, find, key_of
+from .blocks import Blocks, COEFFICIENTS, find, key_of, with_room
 from .climb import aim, climb, h3_at, INTERVAL, MAX_ITERATIONS, set_out, Status
 from .vector import spline_jet
 
@@ -108,10 +108,7 @@ def keys_along(
             if key == recent[0] or key == recent[1] or key == recent[2] or key == recent[3]:
                 continue
             recent[count % 4] = key
-            if count == len(out):
-                longer = np.zeros(2 * count, np.int64)
-                longer[:count] = out
-                out = longer
+            out = with_room(out, count)
             out[count] = key
             count += 1
     return out[:count]
