@@ -3,8 +3,8 @@
 """
 Every parameter once: name, default, unit, range and help.
 
-The node's declarations, the YAML files and the command line's `-p name:=value` are all made from
-this table.
+The node's declarations and the command line's `-p name:=value` are made from this table. After
+changing it, run scripts/write_parameters.py, which writes config/gr2t.yaml and docs/parameters.md.
 """
 from __future__ import annotations
 
@@ -17,6 +17,14 @@ from typing import Any
 from .errors import InputError
 
 Value = bool | int | float | str
+
+# The first parameter of each group, for config/gr2t.yaml and docs/parameters.md.
+GROUPS = {
+    'pixel_bandwidth': 'The density',
+    'start': 'The rays and the meshes',
+    'depth_min': 'The input',
+    'colour_map': 'The output',
+}
 
 
 def _parameter(
@@ -38,7 +46,6 @@ def _parameter(
 class Settings:
     """All parameters; a value outside its range raises InputError."""
 
-    # the density
     pixel_bandwidth: float = _parameter(
         1.5, 'Standard deviation h1 = h2 of the kernel across the image.',
         unit='px', low=0.5, high=8.0)
@@ -56,7 +63,6 @@ class Settings:
         0.0, 'Spacing of the lattice; h3 is never below it. 0: h3 at the median depth of the '
         'first frame.', unit='m', low=0.0, high=1.0)
 
-    # the rays and the meshes
     start: str = _parameter(
         'robust', 'Where a ray starts: at its observed depth, or (robust) at a neighbour\'s depth '
         'where the observed one is an outlier.', choices=('robust', 'observed'))
@@ -83,7 +89,6 @@ class Settings:
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
 
-    # the input
     depth_min: float = _parameter(
         0.1, 'Depths below are invalid.', unit='m', low=0.0, high=1000.0)
     depth_max: float = _parameter(
@@ -101,7 +106,6 @@ class Settings:
         10, 'Images that may wait for the worker; when full the oldest is dropped, and counted.',
         low=1, high=1000)
 
-    # the output
     colour_map: str = _parameter(
         'turbo', 'Colours from low (blue) to high (red) likelihood.',
         choices=('turbo', 'jet', 'coolwarm', 'viridis'))

@@ -1,20 +1,35 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """Parameter files, displays, the Fast DDS profile and launch files agree with the node."""
+import argparse
 import ast
 from dataclasses import fields
+from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
-import re
+from types import ModuleType
 import xml.etree.ElementTree as ElementTree
 
 import pytest
 import yaml
 
 from gr2t_ros.settings import Settings
+from gr2t_ros.tools import options
 
 PROJECT = Path(__file__).resolve().parents[1]
 CONFIG = PROJECT / 'config'
 LAUNCH = sorted((PROJECT / 'launch').glob('*.launch.py'))
+
+
+def script(name: str) -> ModuleType:
+    """Return a script as a module."""
+    spec = spec_from_file_location(name, PROJECT / 'scripts' / f'{name}.py')
+    assert spec and spec.loader
+    module = module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+write_parameters = script('write_parameters')
 
 
 def parameters(path: Path) -> dict[str, object]:
@@ -33,21 +48,52 @@ def test_gr2t_yaml_holds_every_parameter_with_its_default() -> None:
         assert type(given[item.name]) is type(item.default), item.name
 
 
-def test_gr2t_yaml_says_what_each_parameter_is() -> None:
-    """The comment above it: its help, unit, range or choices."""
-    text = (CONFIG / 'gr2t.yaml').read_text()
+@pytest.mark.parametrize(('file', 'text'), [
+    (CONFIG / 'gr2t.yaml', write_parameters.yaml_text()),
+    (PROJECT / 'docs' / 'parameters.md', write_parameters.markdown_text()),
+], ids=lambda item: getattr(item, 'name', ''))
+def test_generated_files_are_those_of_the_table(file: Path, text: str) -> None:
+    """After a change of settings.py: scripts/write_parameters.py."""
+    assert file.read_text(encoding='utf-8') == text
     for item in fields(Settings):
-        match = re.search(rf'((?:^ +# .*\n)+) +{item.name}: ', text, re.MULTILINE)
-        assert match, item.name
-        comment = ' '.join(match[1].replace('#', ' ').split())
         meta = item.metadata
-        assert meta['help'] in comment
-        if meta['unit']:
-            assert f' {meta["unit"]}, ' in comment
-        if meta['low'] is not None:
-            low, high = re.search(r'(\S+) to (\S+)$', comment).groups()
-            assert (float(low), float(high)) == (meta['low'], meta['high'])
-        assert ' | '.join(meta['choices']) in comment
+        assert meta['help'] in ' '.join(text.replace('#', ' ').split()), item.name
+        for word in (item.name, meta['unit'], *meta['choices']):
+            assert word in text
+
+
+def test_the_command_line_takes_every_parameter() -> None:
+    """As the YAML file writes it."""
+    parser = argparse.ArgumentParser()
+    options.add_arguments(parser)
+    given = [f'-p{item.name}:={write_parameters.value_text(item.default)}'
+             for item in fields(Settings)]
+    assert options.settings(parser.parse_args(given)) == Settings()
+
+
+def test_the_node_declares_every_parameter() -> None:
+    """With the table's help, unit, range and choices, as `ros2 param describe` shows them."""
+    rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not installed')
+    from gr2t_ros.ros.parameters import read_parameters
+    context = rclpy.Context()
+    context.init()
+    node = rclpy.create_node(
+        'gr2t', context=context, automatically_declare_parameters_from_overrides=True,
+        start_parameter_services=False)
+    try:
+        assert read_parameters(node) == Settings()
+        for item in fields(Settings):
+            assert node.get_parameter(item.name).value == item.default
+            described, meta = node.describe_parameter(item.name), item.metadata
+            assert described.description.startswith(meta['help'])
+            assert meta['unit'] in described.description
+            assert all(word in described.additional_constraints for word in meta['choices'])
+            ranges = [*described.floating_point_range, *described.integer_range]
+            assert [(span.from_value, span.to_value) for span in ranges] == (
+                [] if meta['low'] is None else [(meta['low'], meta['high'])]), item.name
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
 
 
 @pytest.mark.parametrize('path', sorted(CONFIG.glob('*.yaml')), ids=lambda path: path.stem)
