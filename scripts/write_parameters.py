@@ -14,6 +14,8 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+import yaml  # noqa: E402
+
 from gr2t_ros.settings import GROUPS, Settings  # noqa: E402
 
 YAML_HEAD = """\
@@ -34,6 +36,17 @@ MARKDOWN_HEAD = """\
 Of `gr2t_node` and of the command line; scripts/write_parameters.py writes this page. Give them as
 `-p name:=value`, or in a file like [config/gr2t.yaml](../config/gr2t.yaml), which holds all with
 their defaults. A running node describes its own: `ros2 param describe /gr2t NAME`.
+"""
+
+PRESETS_HEAD = """\
+## Presets
+
+`gr2t replay BAG --preset NAME`, `ros2 launch gr2t_ros live.launch.py preset:=NAME`. Each is a file
+in [config](../config), which names the source of its numbers and the camera's usual topics. h3 is
+about one standard deviation of the noise at the depth z, both in metres.
+
+| Preset | For | Depths | h3 |
+|---|---|---|---|
 """
 
 
@@ -60,7 +73,22 @@ def markdown_text() -> str:
                 f'| `{item.name}` | {value_text(item.default)} | {_limits(item, ", ")} | '
                 f'{item.metadata["help"]} |')
         lines.append('')
-    return '\n'.join(lines)
+    return '\n'.join(lines) + '\n' + PRESETS_HEAD + '\n'.join(map(_preset, presets())) + '\n'
+
+
+def presets() -> list[Path]:
+    """Return the parameter files for sensors and scenes."""
+    return [path for path in sorted((ROOT / 'config').glob('*.yaml')) if path.stem != 'gr2t']
+
+
+def _preset(file: Path) -> str:
+    """Return a preset's row."""
+    text = file.read_text(encoding='utf-8')
+    values = Settings().updated(yaml.safe_load(text)['/**']['ros__parameters'])
+    return (
+        f'| `{file.stem}` | {text.splitlines()[0].lstrip("# ")} '
+        f'| {values.depth_min:g} to {values.depth_max:g} m '
+        f'| {values.depth_bandwidth:g} + {values.depth_bandwidth_quadratic:g} z² |')
 
 
 def groups() -> Iterator[tuple[str, list[Field[Any]]]]:

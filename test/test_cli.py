@@ -74,7 +74,7 @@ def test_version_is_printed() -> None:
     (['replay', 'a.bag', '-p', 'depth_max:=far'],
      "gr2t: parameter depth_max must be a number, not 'far'"),
     (['replay', 'a.bag', '--params', 'none.yaml'], 'gr2t: none.yaml: No such file'),
-    (['replay', 'a.bag', '--preset', 'none'], 'gr2t: there is no preset none; known are gr2t, '),
+    (['replay', 'a.bag', '--preset', 'none'], 'gr2t: there is no preset none; known are azure'),
     (['replay', 'none.bag'], 'gr2t: none.bag: no such file or folder'),
 ])
 def test_a_call_that_cannot_be_used_is_one_line(

@@ -9,6 +9,8 @@ from pathlib import Path
 from types import ModuleType
 import xml.etree.ElementTree as ElementTree
 
+import numpy as np
+from numpy.typing import NDArray
 import pytest
 import yaml
 
@@ -18,6 +20,7 @@ from gr2t_ros.tools import options
 PROJECT = Path(__file__).resolve().parents[1]
 CONFIG = PROJECT / 'config'
 LAUNCH = sorted((PROJECT / 'launch').glob('*.launch.py'))
+Depths = NDArray[np.float64]
 
 
 def script(name: str) -> ModuleType:
@@ -96,13 +99,55 @@ def test_the_node_declares_every_parameter() -> None:
         context.try_shutdown()
 
 
-@pytest.mark.parametrize('path', sorted(CONFIG.glob('*.yaml')), ids=lambda path: path.stem)
+PRESETS = {path.stem: path for path in write_parameters.presets()}
+
+# Of each preset the source's standard deviation of the noise at the depth z, and what the preset
+# may add to it: all in metres.
+LAWS = {
+    'realsense_d400': (lambda z: stereo_noise(z, 0.08, 424, 0.05), 0.0005),
+    'kinect_v1': (lambda z: 0.0012 + 0.0019 * (z - 0.4) ** 2, 0.0),
+    'azure_kinect': (lambda z: 0.017 * (z / 3.86) ** 2, 0.001),
+    'zed': (lambda z: 0.03 * (z / 3) ** 2, 0.001),
+    'tabletop_scan': (lambda z: stereo_noise(z, 0.08, 424, 0.095), 0.001),
+    'room_scan': (lambda z: stereo_noise(z, 0.08, 424, 0.095), 0.002),
+}
+
+
+def stereo_noise(z: Depths, disparity: float, focal: float, baseline: float) -> Depths:
+    """Return Keselman et al. 2017, equation 2: disparity noise and focal length in pixels."""
+    return z ** 2 * disparity / (focal * baseline)
+
+
+def test_there_is_a_preset_for_each_sensor_and_scene() -> None:
+    assert PRESETS.keys() == LAWS.keys()
+
+
+@pytest.mark.parametrize('path', PRESETS.values(), ids=lambda path: path.stem)
 def test_presets_can_be_used(path: Path) -> None:
     given = parameters(path)
     settings = Settings().updated(given)
     for name, value in given.items():
         assert getattr(settings, name) == value
         assert type(value) is type(getattr(settings, name)), f'{name} needs a decimal point'
+
+
+@pytest.mark.parametrize('name', LAWS)
+def test_presets_follow_their_sources(name: str) -> None:
+    """Over the whole range: within 20 % of the law, and what is added to it."""
+    source, added = LAWS[name]
+    settings = Settings().updated(parameters(PRESETS[name]))
+    z = np.linspace(settings.depth_min, settings.depth_max, 200)
+    bandwidth = settings.depth_bandwidth + settings.depth_bandwidth_quadratic * z ** 2
+    assert (bandwidth > 0.8 * source(z)).all()
+    assert (bandwidth < 1.2 * source(z) + added).all()
+
+
+def test_sources_agree_where_they_overlap() -> None:
+    """The Kinect's measured noise is above the one derived from its disparities, and near it."""
+    z = np.linspace(2.0, 4.0, 50)
+    settings = Settings().updated(parameters(PRESETS['kinect_v1']))
+    bandwidth = settings.depth_bandwidth + settings.depth_bandwidth_quadratic * z ** 2
+    assert np.abs(bandwidth / (0.001425 * z ** 2) - 1).max() < 0.2
 
 
 def test_displays_get_what_was_sent_before_they_started() -> None:

@@ -85,14 +85,17 @@ def test_it_stays_short() -> None:
     str(path.relative_to(ROOT)) for path in sorted(ROOT.glob('docs/*.md')))])
 def test_links_lead_to_files_and_headings(file: str) -> None:
     text = (ROOT / file).read_text(encoding='utf-8')
-    links = re.findall(r'\]\(\s*([^)\s]+)\s*\)', text)
-    headings = {re.sub(r'[^\w -]', '', line.lstrip('# ').lower()).replace(' ', '-')
-                for line in text.splitlines() if line.startswith('#')}
-    for link in links:
-        if link.startswith('#'):
-            assert link[1:] in headings, link
-        elif '://' not in link:
-            assert ((ROOT / file).parent / link).exists(), link
+    for link in re.findall(r'\]\(\s*([^)\s]+)\s*\)', text):
+        if '://' in link:
+            continue
+        name, _, heading = link.partition('#')
+        target = (ROOT / file).parent / name if name else ROOT / file
+        assert target.exists(), link
+        headings = {
+            re.sub(r'[^\w -]', '', line.lstrip('# ').lower()).replace(' ', '-')
+            for line in (target.read_text(encoding='utf-8').splitlines() if heading else ())
+            if line.startswith('#')}
+        assert not heading or heading in headings, link
 
 
 def test_parameters_that_it_sets_exist() -> None:
@@ -100,8 +103,9 @@ def test_parameters_that_it_sets_exist() -> None:
     for name, value in re.findall(r'-p (\w+):=(\S+)', README):
         assert name in known
         Settings().updated({name: value})
+    known |= {'gr2t_node', *(path.stem for path in ROOT.glob('config/*.yaml'))}
     for name in re.findall(r'`(\w+_\w+)`', README):  # such as `depth_bandwidth`
-        assert name in known | {'tabletop_scan', 'gr2t_node'} or name.isupper(), name
+        assert name in known or name.isupper(), name
 
 
 RUN_HERE = [
