@@ -36,7 +36,7 @@ def assembler(max_waiting=10, rectified=False, info=True, **settings):
 
 def move(frames, *stamps_ns, parent='map', child='camera', x=1.0, static=False):
     for stamp_ns in stamps_ns:
-        frames.on_transforms(
+        frames.world.on_transforms(
             tf(transform(parent, child, stamp_ns, at(x * stamp_ns / S))), static)
 
 
@@ -69,7 +69,7 @@ class TestPoseFromTf:
         move(frames, 100 * MS)
         view, = frames.ready()
         np.testing.assert_allclose(view.T_world_camera, at(0.05), atol=1e-9)
-        assert view.stamp_ns == 50 * MS and frames.world_frame == 'map'
+        assert view.stamp_ns == 50 * MS and frames.world.frame == 'map'
         assert (view.camera.width, view.camera.height) == (8, 6)
         np.testing.assert_allclose(view.depth, 1.5)
         assert frames.ready() == [] and not frames.dropped
@@ -94,12 +94,12 @@ class TestPoseFromTf:
         frames = assembler()
         move(frames, 0, 100 * MS, parent='odom', child='base')
         move(frames, 0, parent='/base', child='/camera', static=True)
-        frames.on_transforms(tf(transform('map', 'odom', 0, at(5))), True)
+        frames.world.on_transforms(tf(transform('map', 'odom', 0, at(5))), True)
         frames.on_depth(depth(50 * MS, frame='/camera'))
         frames.on_camera_info(camera_info(frame='/camera'))
         view, = frames.ready()
         np.testing.assert_allclose(view.T_world_camera, at(5.05), atol=1e-9)
-        assert frames.world_frame == 'map'
+        assert frames.world.frame == 'map'
 
     def test_a_given_world_frame_is_kept(self):
         frames = assembler(world_frame='/odom')
@@ -107,7 +107,7 @@ class TestPoseFromTf:
         move(frames, 0, 100 * MS, parent='odom', child='camera')
         frames.on_depth(depth(50 * MS))
         np.testing.assert_allclose(frames.ready()[0].T_world_camera, at(0.05), atol=1e-9)
-        assert frames.world_frame == 'odom'
+        assert frames.world.frame == 'odom'
 
     def test_a_tree_of_static_transforms_alone_is_no_world(self):
         frames = assembler()
@@ -167,7 +167,7 @@ class TestPoseFromTf:
         bad = transform('map', 'camera', 50 * MS, at(1))
         bad.transform.translation.x = np.nan
         move(frames, 0, 20 * MS)
-        frames.on_transforms(tf(bad), False)
+        frames.world.on_transforms(tf(bad), False)
         move(frames, 80 * MS, 100 * MS)
         for stamp_ns in (10 * MS, 30 * MS, 50 * MS, 70 * MS, 90 * MS):
             frames.on_depth(depth(stamp_ns))
@@ -180,7 +180,7 @@ class TestPoseFromTf:
         move(frames, 0, S, parent='camera', child='map')
         frames.on_depth(depth(0))
         assert len(settled(frames)) == 1
-        assert 'camera -> map' in frames.explanations['transform_loop']
+        assert 'camera -> map' in frames.world.explanations['transform_loop']
 
     def test_after_a_jump_back_in_time_it_goes_on(self):
         frames = assembler()
@@ -253,7 +253,7 @@ class TestPoseFromMessages:
             frames.on_depth(depth(stamp_ns))
         view, = frames.ready()
         np.testing.assert_allclose(view.T_world_camera, at(0.05), atol=1e-9)
-        assert frames.world_frame == 'map' and frames.waiting == 1
+        assert frames.world.frame == 'map' and frames.waiting == 1
         assert f'the {source} message is needed at 0.150 s' in lost(
             frames, 'no_pose', seen=1)
 
@@ -263,7 +263,7 @@ class TestPoseFromMessages:
         frames.on_depth(depth(50 * MS))
         assert frames.ready() == []
         T_base_camera = at(3, turn=0.5)
-        frames.on_transforms(tf(transform('base', 'mount', 0, at(2)),
+        frames.world.on_transforms(tf(transform('base', 'mount', 0, at(2)),
                                 transform('mount', 'camera', 0, at(-2) @ T_base_camera)), True)
         view, = frames.ready()
         np.testing.assert_allclose(view.T_world_camera, at(0.05) @ T_base_camera, atol=1e-9)
@@ -277,10 +277,10 @@ class TestPoseFromMessages:
 
     def test_tf_leads_from_the_messages_frame_to_a_given_world(self):
         frames = self.filled('odometry', 'camera', parent='odom', world_frame='map')
-        frames.on_transforms(tf(transform('map', 'odom', 0, at(5))), True)
+        frames.world.on_transforms(tf(transform('map', 'odom', 0, at(5))), True)
         frames.on_depth(depth(50 * MS))
         np.testing.assert_allclose(frames.ready()[0].T_world_camera, at(5.05), atol=1e-9)
-        assert frames.world_frame == 'map'
+        assert frames.world.frame == 'map'
 
     def test_without_any_name_of_the_world(self):
         frames = self.filled('pose', parent='')
@@ -449,11 +449,12 @@ def test_a_recording_gives_the_depths_and_poses_that_it_was_made_of(data):
             elif connection.msgtype.endswith('CameraInfo'):
                 frames.on_camera_info(msg)
             else:
-                frames.on_transforms(msg, connection.topic == '/tf_static')
+                frames.world.on_transforms(msg, connection.topic == '/tf_static')
             views += frames.ready()
             if len(views) == 10:
                 break
-    assert frames.world_frame == 'map' and not frames.dropped and not frames.explanations
+    assert frames.world.frame == 'map' and not frames.dropped
+    assert not frames.explanations and not frames.world.explanations
     original = data / 'real_rgbd' / 'redkitchen'
     for i, view in enumerate(views):
         name = f'frame-{10 * i:06}'

@@ -60,19 +60,26 @@ class Rig:
     def __init__(self, bag: Path, settings: Settings) -> None:
         self.outputs = Outputs()
         self.log = Log()
-        self.worker = Worker(settings, self.outputs, self.log, rectified=True)
+        self.worker = Worker(settings, self.outputs, self.log, rectified={'': True})
         with Bag([bag]) as opened:
             self.messages = [
                 (topic, message) for topic, message, _ in opened.messages(opened.topics)]
-        self.images = [message for topic, message in self.messages if topic == DEPTH_TOPIC]
+
+    @property
+    def integrated(self) -> int:
+        return self.worker.intake.cameras[''].integrated
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        return self.worker.intake.cameras[''].dropped
 
     def feed(self, *topics: str) -> None:
         """Hand over all messages of these topics; of all where none is named."""
         hands: dict[str, Callable[[Any], None]] = {
-            DEPTH_TOPIC: self.worker.on_depth,
-            CAMERA_INFO_TOPIC: self.worker.on_camera_info,
-            '/tf': lambda message: self.worker.on_transforms(message, static=False),
-            '/tf_static': lambda message: self.worker.on_transforms(message, static=True)}
+            DEPTH_TOPIC: self.worker.intake.on_depth,
+            CAMERA_INFO_TOPIC: self.worker.intake.on_camera_info,
+            '/tf': lambda message: self.worker.intake.on_transforms(message, static=False),
+            '/tf_static': lambda message: self.worker.intake.on_transforms(message, static=True)}
         for topic, message in self.messages:
             if topic in (topics or hands):
                 hands[topic](message)
@@ -124,14 +131,14 @@ def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
 def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> None:
     rig = make()
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.wait(lambda: rig.outputs.published[-1:] and rig.outputs.published[-1][2] == COUNT,
              'the last frame\'s publication')
     frame, stamp_ns, _ = rig.outputs.published[-1]
     assert frame == 'map'
     assert stamp_ns == 1_700_000_000_400_000_000
     assert rig.outputs.changed == set(range(max(rig.outputs.changed) + 1))
-    assert rig.worker.dropped == {}
+    assert rig.dropped == {}
     rig.worker.stop()
     assert '5 received, 5 integrated, 0 dropped, 0 waiting' in rig.worker.summary()
 
@@ -139,9 +146,9 @@ def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> No
 def test_a_full_queue_loses_the_oldest_images(make: Callable[..., Rig]) -> None:
     rig = make(start=False, queue_size=2)
     rig.feed()
-    assert rig.worker.dropped == {'queue_full': COUNT - 2}
+    assert rig.dropped == {'queue_full': COUNT - 2}
     rig.worker.start()
-    rig.wait(lambda: rig.worker.integrated == 2, 'the other frames')
+    rig.wait(lambda: rig.integrated == 2, 'the other frames')
     rig.wait(lambda: rig.outputs.published, 'a publication')
     rig.wait(lambda: rig.outputs.published[-1][1] == 1_700_000_000_400_000_000, 'the newest')
     assert rig.said('queue_full') == 1
@@ -160,31 +167,31 @@ def test_one_frame_that_fails_costs_itself_only(
     monkeypatch.setattr(Reconstruction, 'add', fails_once)
     rig = make()
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT - 1, 'the other frames')
-    assert rig.worker.dropped == {'error': 1}
+    rig.wait(lambda: rig.integrated == COUNT - 1, 'the other frames')
+    assert rig.dropped == {'error': 1}
     assert rig.said('the frame of 1700000000.200 s failed: ZeroDivisionError: a defect') == 1
 
 
 def test_paused_images_are_counted(make: Callable[..., Rig]) -> None:
     rig = make()
-    rig.worker.pause(True)
+    rig.worker.intake.pause(True)
     rig.feed()
-    assert rig.worker.dropped == {'paused': COUNT}
-    rig.worker.pause(False)
+    assert rig.dropped == {'paused': COUNT}
+    rig.worker.intake.pause(False)
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'the frames after the pause')
+    rig.wait(lambda: rig.integrated == COUNT, 'the frames after the pause')
 
 
 def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
     rig = make()
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.worker.reset()
     with pytest.raises(InputError, match='nothing to save'):
         rig.worker.snapshot().result(LIMIT)
     assert rig.outputs.cleared == ['map']
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == 2 * COUNT, 'the frames after the reset')
+    rig.wait(lambda: rig.integrated == 2 * COUNT, 'the frames after the reset')
     assert rig.worker.snapshot().result(LIMIT).vertices > 0
 
 
@@ -204,19 +211,19 @@ def test_reset_and_pause_do_not_wait_for_a_frame(
     rig.feed()
     assert busy.wait(LIMIT)
     rig.worker.reset()
-    rig.worker.pause(True)
+    rig.worker.intake.pause(True)
     answer = rig.worker.snapshot()
     go.set()
     with pytest.raises(InputError, match='nothing to save'):
         answer.result(LIMIT)
-    assert rig.worker.dropped == {'reset': COUNT - 1}
+    assert rig.dropped == {'reset': COUNT - 1}
     assert rig.outputs.cleared == ['map']
 
 
 def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path) -> None:
     rig = make()
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     paths = [rig.worker.snapshot().result(LIMIT).path for _ in range(3)]
     assert len(set(paths)) == 3
     for path in paths:
@@ -228,7 +235,7 @@ def test_a_snapshot_on_exit_where_asked(make: Callable[..., Rig], tmp_path: Path
     for wanted in (False, True):
         rig = make(snapshot_on_exit=wanted)
         rig.feed()
-        rig.wait(lambda rig=rig: rig.worker.integrated == COUNT, 'all frames')
+        rig.wait(lambda rig=rig: rig.integrated == COUNT, 'all frames')
         rig.worker.stop()
         assert len(list(tmp_path.glob('snapshots/*.ply'))) == wanted
 
@@ -237,7 +244,7 @@ def test_a_folder_that_cannot_be_made_is_named(make: Callable[..., Rig], tmp_pat
     (tmp_path / 'file').write_text('')
     rig = make(snapshot_directory=str(tmp_path / 'file' / 'inside'))
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     with pytest.raises(Exception, match='file/inside'):
         rig.worker.snapshot().result(LIMIT)
 
@@ -246,8 +253,8 @@ def test_images_whose_pose_never_comes_are_given_up(make: Callable[..., Rig]) ->
     """Also when no more messages arrive; the reason is said once."""
     rig = make(max_wait_for_pose=0.05)
     rig.feed(DEPTH_TOPIC, CAMERA_INFO_TOPIC, '/tf_static')
-    rig.wait(lambda: sum(rig.worker.dropped.values()) == COUNT, 'the images to be given up')
-    (reason, count), = rig.worker.dropped.items()
+    rig.wait(lambda: sum(rig.dropped.values()) == COUNT, 'the images to be given up')
+    (reason, count), = rig.dropped.items()
     assert count == COUNT
     assert rig.said(f'[{reason}: said once') == 1
 
@@ -256,5 +263,5 @@ def test_rays_that_wait_are_marched_when_idle(make: Callable[..., Rig]) -> None:
     """Without time for older rays while frames come, the map is complete soon after."""
     rig = make(remarch_budget=0.0, keyframe_translation=0.0)
     rig.feed()
-    rig.wait(lambda: rig.worker.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.wait(lambda: rig.worker.waiting_rays == 0, 'the older rays')

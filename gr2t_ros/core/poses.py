@@ -294,8 +294,9 @@ class TransformTree:
         return inverse(self._product(up_target[:-1], stamp_ns)) @ T_common_source
 
     def frames(self) -> list[str]:
-        """Return the names of all frames, sorted."""
-        return sorted(self._links.keys() | {link.parent for link in self._links.values()})
+        """Return the names of all frames, sorted; any thread may ask."""
+        links = self._links.copy()
+        return sorted(links.keys() | {link.parent for link in links.values()})
 
     def root(self, frame: str) -> str:
         """Return the frame's highest ancestor; itself where it has no parent or is unknown."""

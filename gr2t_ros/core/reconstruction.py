@@ -205,10 +205,12 @@ class Reconstruction:
         return Keyframe(view, rays, blocks)
 
     def _is_keyframe(self, view: View) -> bool:
-        """Tell whether the camera has moved or turned enough since the last keyframe."""
-        if not self.keyframes:
+        """Tell whether the camera has moved or turned enough since its last keyframe."""
+        former = next((keyframe.view for keyframe in reversed(self.keyframes)
+                       if keyframe.view.camera_name == view.camera_name), None)
+        if former is None:
             return True
-        last, new = self.keyframes[-1].view.T_world_camera, view.T_world_camera
+        last, new = former.T_world_camera, view.T_world_camera
         moved = float(np.linalg.norm(new[:3, 3] - last[:3, 3]))
         cosine = (np.trace(last[:3, :3].T @ new[:3, :3]) - 1) / 2
         turned = float(np.arccos(np.clip(cosine, -1, 1)))

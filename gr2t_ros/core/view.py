@@ -20,9 +20,11 @@ class View:
     :param camera: intrinsics of this image, same width and height
     :param T_world_camera: (4, 4) float64, camera (optical frame) to world, metres
     :param stamp_ns: acquisition time, nanoseconds
+    :param camera_name: which camera it is of, where there are several
     """
 
     depth: NDArray[np.float32]
     camera: Camera
     T_world_camera: NDArray[np.float64]
     stamp_ns: int
+    camera_name: str = ''

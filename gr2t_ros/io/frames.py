@@ -11,20 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.camera import Camera
-from ..core.poses import (
-    HISTORY,
-    listed,
-    NotYet,
-    plain,
-    Pose,
-    PoseBuffer,
-    seconds,
-    TransformTree,
-)
+from ..core.poses import listed, NotYet, plain
 from ..core.view import View
 from ..errors import FrameError
 from ..settings import Settings
 from . import messages
+from .camera_poses import CameraPoses
+from .world import World
 
 _MAX_CAMERAS = 16  # frames of which a camera_info is kept
 # Medians beyond these are no scene, but millimetres taken for metres or the reverse.
@@ -41,50 +34,47 @@ class _Image:
 
 class FrameAssembler:
     """
-    Turns the messages of a recording or of live topics into views.
+    Turns the messages of one camera, of a recording or live, into views.
 
     An image waits until a message has brought its pose and its camera. It is given up when it
     has waited for settings.max_wait_for_pose, when too many wait, or at the end (flush). Every
     image that was read is returned, waiting, or counted in `dropped`.
 
-    Its camera is the latest camera_info of its frame and size. Its pose is that of its frame in
-    the world frame at its stamp: from tf, or from the pose messages that settings.pose_source
-    names. Those give the camera's pose, or where they have a child_frame_id other than the
-    image's frame, that frame's, and tf leads on to the image's. The past of tf reaches back far
-    enough for images to come late; should its time jump back, see PoseBuffer. Not safe for use
-    by several threads at once.
-
-    Where no world_frame is set it is that of the pose messages, or the root of the tf tree above
-    the camera at the first image that has a pose, provided that something moves between the two.
+    Its camera is the latest camera_info of its frame and size, its pose that of its frame in the
+    world at its stamp (see CameraPoses). The past of poses reaches back far enough for images to
+    come late; should their time jump back, see PoseBuffer. Not safe for use by several threads at
+    once.
 
     read: images read so far. dropped: images that gave no view, by reason. explanations: for each
-    reason, and for transforms that were left out, the sentence of the first case. tree: the frames
-    known to tf. world_frame: the frame of the views' poses; '' until it is known.
+    reason, and for poses that were left out, the sentence of the first case. world: where the
+    views are.
 
     :param settings: of which the input's count
+    :param world: shared with other cameras; None: its own
+    :param name: of the camera, where there are several
     :param rectified: whether the images are rectified, so that camera_info's P counts, not K and D
     :param max_waiting: images that may wait for their poses
     """
 
-    def __init__(self, settings: Settings, *, rectified: bool, max_waiting: int = 10) -> None:
-        history = HISTORY + settings.max_wait_for_pose
+    def __init__(
+        self, settings: Settings, world: World | None = None, *, name: str = '',
+        rectified: bool, max_waiting: int = 10,
+    ) -> None:
         self.read = 0
         self.dropped: Counter[str] = Counter()
         self.explanations: dict[str, str] = {}
-        self.tree = TransformTree(history)
-        self.world_frame = plain(settings.world_frame)
+        self.world = world or World(settings)
         self._settings = settings
+        self._name = name
         self._rectified = rectified
         self._max_waiting = max_waiting
         self._max_wait_ns = int(settings.max_wait_for_pose * 1e9)
-        self._history = history
         self._now_ns = 0
         # of each frame the last two cameras, each with the stamp from which on it holds
         self._cameras: dict[str, list[tuple[int, Camera]]] = {}
         self._bad_cameras: dict[str, FrameError] = {}
         self._camera_frame = ''
-        self._pose_frames = ('', '')
-        self._poses = PoseBuffer(f'the {settings.pose_source} message', history)
+        self._poses = CameraPoses(settings, self.world)
         self._images: deque[_Image] = deque()
         self._views: list[View] = []
 
@@ -117,19 +107,6 @@ class FrameAssembler:
             del self._cameras[oldest]
             self._bad_cameras.pop(oldest, None)
 
-    def on_transforms(self, msg: Any, static: bool) -> None:
-        """
-        Take a tf message.
-
-        :param msg: tf2_msgs/TFMessage
-        :param static: whether it came on /tf_static
-        """
-        for item in messages.transforms(msg):
-            try:
-                self.tree.add(*item, static)
-            except FrameError as error:
-                self._explain(error)
-
     def on_pose(self, msg: Any) -> None:
         """
         Take a pose message.
@@ -137,14 +114,9 @@ class FrameAssembler:
         :param msg: the message that settings.pose_source names
         """
         try:
-            item = messages.pose(msg, self._settings.pose_source)
+            self._poses.on_pose(msg)
         except FrameError as error:
             self._explain(error)
-            item = messages.unknown_pose(msg)
-        if (item.parent, item.child) != self._pose_frames:
-            self._pose_frames = (item.parent, item.child)
-            self._poses = PoseBuffer(self._poses.name, self._history)
-        self._poses.add(item.stamp_ns, item.T_parent_child)
 
     def on_depth(self, msg: Any, received_ns: int | None = None) -> None:
         """
@@ -210,12 +182,10 @@ class FrameAssembler:
 
     def _view(self, image: _Image) -> View:
         frame = image.frame or self._camera_frame
-        if self._settings.pose_source == 'tf':
-            T_world_camera = self._pose_by_tf(frame, image.stamp_ns)
-        else:
-            T_world_camera = self._pose_by_message(frame, image.stamp_ns)
+        T_world_camera = self._poses.lookup(frame, image.stamp_ns)
         camera = self._camera(frame, image)
-        return View(image.depth, camera, np.array(T_world_camera), image.stamp_ns)
+        return View(
+            image.depth, camera, np.array(T_world_camera), image.stamp_ns, self._name)
 
     def _camera(self, frame: str, image: _Image) -> Camera:
         frame = frame if frame in self._cameras else ''
@@ -237,52 +207,6 @@ class FrameAssembler:
                 f'for {camera.width}x{camera.height}: choose the camera_info of these images')
         since = [camera for since_ns, camera in fitting if since_ns <= image.stamp_ns]
         return since[-1] if since else fitting[0][1]
-
-    def _pose_by_tf(self, frame: str, stamp_ns: int) -> Pose:
-        """Return T_world_camera."""
-        if not frame:
-            raise FrameError(
-                'no_frame_id', 'neither the depth images nor their camera_info have a frame_id: '
-                'set it in the camera\'s driver, or use a pose topic')
-        world = self.world_frame or self.tree.root(frame)
-        if not self.world_frame and not self.tree.moves(frame):
-            known = self.tree.frames()
-            if frame in known:
-                why = (f'its transforms up to {world} are all static; publish the camera\'s pose, '
-                       f'or set world_frame to {world} if the camera stands still')
-            else:
-                why = f'tf knows {listed(known) or "no frame yet"}; publish the camera\'s pose'
-            raise NotYet('unconnected_frames', f'no pose of the camera frame {frame} at '
-                         f'{seconds(stamp_ns)}: {why}')
-        T_world_camera = self._transform(world, frame, stamp_ns, ' or set world_frame')
-        self.world_frame = world
-        return T_world_camera
-
-    def _pose_by_message(self, frame: str, stamp_ns: int) -> Pose:
-        """Return T_world_camera."""
-        T_parent_child = self._poses.lookup(stamp_ns)
-        parent, child = self._pose_frames
-        world = self.world_frame or parent
-        if not world:
-            raise FrameError(
-                'no_world_frame', 'the pose messages have no frame_id: set world_frame')
-        T_world_camera = T_parent_child
-        if child and frame and child != frame:
-            hint = f': the {self._settings.pose_source} messages are of {child}'
-            T_world_camera = T_world_camera @ self._transform(child, frame, stamp_ns, hint)
-        if parent and parent != world:
-            T_world_parent = self._transform(world, parent, stamp_ns, ' or set world_frame')
-            T_world_camera = T_world_parent @ T_world_camera
-        self.world_frame = world
-        return T_world_camera
-
-    def _transform(self, target: str, source: str, stamp_ns: int, hint: str) -> Pose:
-        try:
-            return self.tree.lookup(target, source, stamp_ns)
-        except NotYet as error:
-            if error.reason != 'unconnected_frames':
-                raise
-            raise NotYet(error.reason, f'{error}; publish it{hint}') from None
 
     def _in_range(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Make depths outside depth_min and depth_max invalid, in place."""

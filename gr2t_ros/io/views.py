@@ -36,7 +36,7 @@ def views(
         elif topic == sources.poses.topic:
             assembler.on_pose(message)
         else:
-            assembler.on_transforms(message, static=is_static(topic))
+            assembler.world.on_transforms(message, static=is_static(topic))
         yield from assembler.ready()
     yield from assembler.flush()
 

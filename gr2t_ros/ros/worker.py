@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future
 import threading
 import time
@@ -14,12 +14,11 @@ from typing import Any, Protocol
 from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
 from ..errors import FrameError
-from ..io.frames import FrameAssembler
 from ..io.ply import Written
 from ..io.snapshots import save_snapshot
 from ..settings import Settings
+from .intake import Intake
 
-MAX_MESSAGES = 20_000  # other than images that may wait: 20 s of a 1 kHz tf
 _IDLE_STEP = 0.1  # s of marching before another look at the queue
 
 
@@ -55,23 +54,23 @@ class Worker:
     """
     The map and the thread that builds it.
 
-    Methods named on_... and the services' may be called from any thread, and only enqueue. Images
-    wait in a bounded queue: when it is full the oldest is dropped, and counted.
+    The services' methods may be called from any thread, and only enqueue.
+
+    intake: where the messages go.
 
     :param settings: parameters
     :param outputs: called from the worker's thread, publish_rate times a second
     :param log: likewise
-    :param rectified: whether the depth images are
+    :param rectified: see Intake
     """
 
     def __init__(
-        self, settings: Settings, outputs: Outputs, log: Log, *, rectified: bool
+        self, settings: Settings, outputs: Outputs, log: Log, *, rectified: Mapping[str, bool]
     ) -> None:
         self._settings = settings
         self._outputs = outputs
         self._log = log
-        self._assembler = FrameAssembler(
-            settings, rectified=rectified, max_waiting=settings.queue_size)
+        self.intake = Intake(settings, rectified, self._notify)
         self._reconstruction = Reconstruction(settings)
         self._in_map = 0  # views since the last reset
         self.waiting_rays = 0
@@ -80,16 +79,10 @@ class Worker:
         self._publish_at = 0.0
 
         self._wake = threading.Condition()
-        self._messages: deque[tuple[Callable[[], None], bool]] = deque()  # feed, is an image
-        self._images = 0
         self._orders: deque[Callable[[], None]] = deque()
         self._stop = False
-        self._paused = False
         self._thread = threading.Thread(target=self._run, name='worker')
 
-        self.received = 0
-        self.integrated = 0
-        self._dropped: Counter[str] = Counter()
         self._told: set[str] = set()
         self._seconds: Counter[str] = Counter()
 
@@ -109,48 +102,10 @@ class Worker:
         """Return whether it runs."""
         return self._thread.is_alive()
 
-    def on_depth(self, message: Any) -> None:
-        """Enqueue a depth image."""
-        received_ns = time.monotonic_ns()
-        with self._wake:
-            self.received += 1
-            if self._paused:
-                self._dropped['paused'] += 1
-                return
-            if self._images == self._settings.queue_size:
-                oldest = next(i for i, item in enumerate(self._messages) if item[1])
-                del self._messages[oldest]
-                self._dropped['queue_full'] += 1
-            else:
-                self._images += 1
-            self._messages.append(
-                (lambda: self._assembler.on_depth(message, received_ns), True))
-            self._wake.notify()
-
-    def on_camera_info(self, message: Any) -> None:
-        """Enqueue a camera_info."""
-        self._enqueue(lambda: self._assembler.on_camera_info(message))
-
-    def on_transforms(self, message: Any, *, static: bool) -> None:
-        """Enqueue transforms."""
-        self._enqueue(lambda: self._assembler.on_transforms(message, static))
-
-    def on_pose(self, message: Any) -> None:
-        """Enqueue a pose."""
-        self._enqueue(lambda: self._assembler.on_pose(message))
-
-    def pause(self, paused: bool) -> None:
-        """Ignore images from now on, or no longer."""
-        with self._wake:
-            self._paused = paused
-
     def reset(self) -> None:
         """Forget the map, and the images that wait."""
+        self.intake.drop_images('reset')
         with self._wake:
-            kept = [item for item in self._messages if not item[1]]
-            self._dropped['reset'] += len(self._messages) - len(kept)
-            self._messages = deque(kept)
-            self._images = 0
             self._orders.appendleft(self._reset)
             self._wake.notify()
 
@@ -169,32 +124,26 @@ class Worker:
             self._wake.notify()
         return answer
 
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Return the number of images that were not used, by reason."""
-        return dict(self._dropped + self._assembler.dropped)
-
     def summary(self) -> str:
         """Return what became of the images, and how long it took, as text."""
-        dropped = self.dropped
-        reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(dropped.items()))
-        waiting = self.received - self.integrated - sum(dropped.values())
-        lines = [
-            f'frames: {self.received} received, {self.integrated} integrated, '
-            f'{sum(dropped.values())} dropped{f" ({reasons})" if reasons else ""}, '
-            f'{waiting} waiting, {len(self._reconstruction.keyframes)} keyframes']
-        if self.integrated:
+        lines = []
+        for name, camera in self.intake.cameras.items():
+            dropped = camera.dropped
+            reasons = ', '.join(f'{reason} {count}' for reason, count in sorted(dropped.items()))
+            lines.append(
+                f'frames{f" of {name}" if name else ""}: {camera.received} received, '
+                f'{camera.integrated} integrated, {dropped.total()} dropped'
+                f'{f" ({reasons})" if reasons else ""}, {camera.waiting} waiting')
+        lines[-1] += f', {len(self._reconstruction.keyframes)} keyframes'
+        integrated = sum(camera.integrated for camera in self.intake.cameras.values())
+        if integrated:
             lines.append('time: ' + ', '.join(
-                f'{stage} {1000 * seconds / self.integrated:.1f} ms a frame'
+                f'{stage} {1000 * seconds / integrated:.1f} ms a frame'
                 for stage, seconds in self._seconds.items()))
         return '\n'.join(lines)
 
-    def _enqueue(self, feed: Callable[[], None]) -> None:
+    def _notify(self) -> None:
         with self._wake:
-            if len(self._messages) - self._images >= MAX_MESSAGES:
-                oldest = next(i for i, item in enumerate(self._messages) if not item[1])
-                del self._messages[oldest]
-            self._messages.append((feed, False))
             self._wake.notify()
 
     def _run(self) -> None:
@@ -215,7 +164,7 @@ class Worker:
         """Wait for the next thing to do; None: stop."""
         with self._wake:
             self._wake.wait_for(
-                lambda: self._stop or self._orders or self._views or self._messages,
+                lambda: self._stop or self._orders or self._views or self.intake.queued,
                 timeout=0.0 if self.waiting_rays else 1.0 / self._settings.publish_rate)
             if self._stop:
                 return None
@@ -224,39 +173,32 @@ class Worker:
             if self._views:
                 view = self._views.popleft()
                 return lambda: self._integrate(view)
-            if self._messages:
-                feed, image = self._messages.popleft()
-                self._images -= image
-                return lambda: self._feed(feed)
+            if self.intake.queued:
+                return self._take
         return self._idle
 
     def _idle(self) -> None:
         if self.waiting_rays:
             self._account(self._reconstruction.finish(_IDLE_STEP))
-        self._feed(lambda: None)  # images may have waited for their poses long enough
+        self._take()
 
-    def _feed(self, feed: Callable[[], None]) -> None:
-        feed()
-        self._views.extend(self._assembler.ready(time.monotonic_ns()))
-        for reason, sentence in self._assembler.explanations.items():
-            self._tell(reason, sentence)
-        if self._dropped['queue_full']:
-            self._tell(
-                'queue_full', 'images come faster than they can be integrated, and the oldest are '
-                'left out: raise ray_stride or lower the frame rate')
+    def _take(self) -> None:
+        self._views.extend(self.intake.take())
+        for reason, sentence in self.intake.news():
+            self._log.warning(f'{sentence} [{reason}: said once, then counted]')
 
     def _integrate(self, view: View) -> None:
         try:
             update = self._reconstruction.add(view)
         except FrameError as error:
-            self._dropped[error.reason] += 1
+            self.intake.drop(view, error.reason)
             self._tell(error.reason, str(error))
             return
         except Exception as error:  # costs this frame, not the others
-            self._dropped['error'] += 1
+            self.intake.drop(view, 'error')
             self._fail(f'the frame of {view.stamp_ns * 1e-9:.3f} s', error)
             return
-        self.integrated += 1
+        self.intake.cameras[view.camera_name].integrated += 1
         self._in_map += 1
         self._stamp_ns = view.stamp_ns
         self._account(update)
@@ -270,11 +212,11 @@ class Worker:
 
     def _publish(self) -> None:
         now = time.monotonic()
-        if now < self._publish_at or not self._assembler.world_frame:
+        if now < self._publish_at or not self.intake.world.frame:
             return
         self._publish_at = now + 1.0 / self._settings.publish_rate
         self._outputs.publish(
-            self._reconstruction, self._assembler.world_frame, self._stamp_ns, self._in_map)
+            self._reconstruction, self.intake.world.frame, self._stamp_ns, self._in_map)
 
     def _save(self) -> Written:
         self._account(self._reconstruction.finish())
@@ -282,14 +224,15 @@ class Worker:
             self._reconstruction, self._settings.snapshot_directory, self._settings.colour_map)
 
     def _reset(self) -> None:
-        self._dropped['reset'] += len(self._views)
+        for view in self._views:
+            self.intake.drop(view, 'reset')
         self._views.clear()
         self._reconstruction.close()
         self._reconstruction = Reconstruction(self._settings)
         self._in_map = 0
         self.waiting_rays = 0
-        if self._assembler.world_frame:
-            self._outputs.clear(self._assembler.world_frame)
+        if self.intake.world.frame:
+            self._outputs.clear(self.intake.world.frame)
 
     def _tell(self, reason: str, sentence: str) -> None:
         if reason not in self._told:

@@ -156,7 +156,7 @@ class _Replay:
             done.dropped += assembler.dropped
             # those still on their way when it was stopped count as not read
             done.read = done.integrated + done.dropped.total()
-            done.explanations.update(assembler.explanations)
+            done.explanations.update({**assembler.world.explanations, **assembler.explanations})
             done.input_damage = self._bag.damage
         if interrupted.is_set():
             if not done.integrated:

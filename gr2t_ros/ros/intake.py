@@ -1,0 +1,174 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""Messages on their way to views: a bounded queue, and an assembler for each camera."""
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+import threading
+import time
+from typing import Any
+
+from ..core.view import View
+from ..io.frames import FrameAssembler
+from ..io.world import World
+from ..settings import Settings
+
+MAX_MESSAGES = 20_000  # other than images that may wait: 20 s of a 1 kHz tf
+
+
+@dataclass
+class CameraIntake:
+    """
+    One camera's images; the numbers may be read by any thread.
+
+    received: images that came. integrated: those in the map. queued: those that wait for the
+    worker. lost: those that were dropped before or after the assembler, by reason.
+    """
+
+    assembler: FrameAssembler
+    received: int = 0
+    integrated: int = 0
+    queued: int = 0
+    lost: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def dropped(self) -> Counter[str]:
+        """Return the number of images that were not used, by reason."""
+        return Counter(dict(self.lost)) + Counter(dict(self.assembler.dropped))
+
+    @property
+    def waiting(self) -> int:
+        """Return the number of images of which it is not known yet what becomes of them."""
+        return self.received - self.integrated - self.dropped.total()
+
+
+class Intake:
+    """
+    Takes messages from any thread, and makes views of them, in their order, in the worker's.
+
+    Images wait in a bounded queue: when a camera's are more than queue_size its oldest is dropped,
+    and counted.
+
+    cameras: by name; one without a name where there is only one. world: where their views are.
+
+    :param settings: parameters
+    :param rectified: for each camera's name, whether its depth images are
+    :param notify: called when there is something to do
+    """
+
+    def __init__(
+        self, settings: Settings, rectified: Mapping[str, bool], notify: Callable[[], None]
+    ) -> None:
+        self.world = World(settings)
+        self.cameras = {
+            name: CameraIntake(FrameAssembler(
+                settings, self.world, name=name, rectified=flag, max_waiting=settings.queue_size))
+            for name, flag in rectified.items()}
+        self._queue_size = settings.queue_size
+        self._notify = notify
+        self._lock = threading.Lock()
+        # what to do with a message, and the camera if it is an image
+        self._messages: deque[tuple[Callable[[], None], CameraIntake | None]] = deque()
+        self._paused = False
+        self._told: set[tuple[str, str]] = set()
+
+    def on_depth(self, message: Any, camera: str = '') -> None:
+        """Enqueue a depth image."""
+        received_ns = time.monotonic_ns()
+        into = self.cameras[camera]
+        with self._lock:
+            into.received += 1
+            if self._paused:
+                into.lost['paused'] += 1
+                return
+            if into.queued == self._queue_size:
+                self._remove(lambda of: of is into)
+                into.lost['queue_full'] += 1
+            else:
+                into.queued += 1
+            self._messages.append((lambda: into.assembler.on_depth(message, received_ns), into))
+        self._notify()
+
+    def on_camera_info(self, message: Any, camera: str = '') -> None:
+        """Enqueue a camera_info."""
+        assembler = self.cameras[camera].assembler
+        self._enqueue(lambda: assembler.on_camera_info(message))
+
+    def on_pose(self, message: Any, camera: str = '') -> None:
+        """Enqueue a pose."""
+        assembler = self.cameras[camera].assembler
+        self._enqueue(lambda: assembler.on_pose(message))
+
+    def on_transforms(self, message: Any, *, static: bool) -> None:
+        """Enqueue transforms."""
+        self._enqueue(lambda: self.world.on_transforms(message, static))
+
+    def pause(self, paused: bool) -> None:
+        """Ignore images from now on, or no longer."""
+        with self._lock:
+            self._paused = paused
+
+    def drop(self, view: View, reason: str) -> None:
+        """Count a view that did not come into the map."""
+        with self._lock:
+            self.cameras[view.camera_name].lost[reason] += 1
+
+    def drop_images(self, reason: str) -> None:
+        """Drop the images that wait for the worker."""
+        with self._lock:
+            for _, camera in self._messages:
+                if camera is not None:
+                    camera.lost[reason] += 1
+                    camera.queued = 0
+            self._messages = deque(item for item in self._messages if item[1] is None)
+
+    @property
+    def queued(self) -> int:
+        """Return the number of messages that wait."""
+        return len(self._messages)
+
+    def take(self) -> list[View]:
+        """Take the next message, if there is one; return the views that are ready now."""
+        feed = None
+        with self._lock:
+            if self._messages:
+                feed, camera = self._messages.popleft()
+                if camera is not None:
+                    camera.queued -= 1
+        if feed:
+            feed()
+        now_ns = time.monotonic_ns()  # images may have waited for their poses long enough
+        return [
+            view for camera in self.cameras.values() for view in camera.assembler.ready(now_ns)]
+
+    def news(self) -> list[tuple[str, str]]:
+        """Return reasons for which something was left out, with a sentence, each once."""
+        found = [('', reason, sentence)
+                 for reason, sentence in self.world.explanations.items()]
+        for name, camera in self.cameras.items():
+            found += [(name, reason, sentence)
+                      for reason, sentence in camera.assembler.explanations.items()]
+            if camera.lost['queue_full']:
+                found.append((name, 'queue_full', (
+                    'images come faster than they can be integrated, and the oldest are left out: '
+                    'raise ray_stride or lower the frame rate')))
+        news = []
+        for name, reason, sentence in found:
+            if (name, reason) not in self._told:
+                self._told.add((name, reason))
+                news.append((reason, f'camera {name}: {sentence}' if name else sentence))
+        return news
+
+    def _enqueue(self, feed: Callable[[], None]) -> None:
+        with self._lock:
+            images = sum(camera.queued for camera in self.cameras.values())
+            if len(self._messages) - images >= MAX_MESSAGES:
+                self._remove(lambda of: of is None)
+            self._messages.append((feed, None))
+        self._notify()
+
+    def _remove(self, chosen: Callable[[CameraIntake | None], bool]) -> None:
+        """Remove the oldest message that is chosen by the camera it is an image of."""
+        del self._messages[next(i for i, item in enumerate(self._messages) if chosen(item[1]))]
