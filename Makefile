@@ -1,7 +1,8 @@
-# make demo   simulate a scan, map it live over ROS 2, show the result
-# make test   lint, type check, all tests
-# make bench  what a frame costs, beside Open3D; docs/performance.md explains it
-# make venv   only what these begin with: the environment they run in
+# make demo      simulate a scan, map it live over ROS 2, show the result
+# make test      lint, type check, all tests
+# make test-ros  the tests of what uses ROS: what another DISTRO needs
+# make bench     what a frame costs, beside Open3D; docs/performance.md explains it
+# make venv      only what these begin with: the environment they run in
 #
 # Options: DISTRO=jazzy (wheels; default kilted), PYTHON=python3.12, ARGS='-k camera' for pytest or
 # ARGS=--quick for the benchmark, EXTRAS. Where ROS 2 is sourced it is used, and DISTRO has no
@@ -17,7 +18,7 @@ RUN = $(VENV)/bin/python
 OTHER_HINTS = [ -n "$(ROS_DISTRO)" ] || \
     ! $(RUN) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 
-.PHONY: venv demo test bench clean
+.PHONY: venv demo test test-ros bench clean
 
 venv:
 	@$(or $(PYTHON),python3) scripts/setup_venv.py --venv $(VENV) --distro $(DISTRO) \
@@ -30,6 +31,9 @@ test: venv
 	$(RUN) -m ruff check
 	@$(RUN) -m mypy || { $(OTHER_HINTS) && echo 'not counted: hints of other releases'; }
 	$(RUN) -m pytest $(ARGS)
+
+test-ros: venv
+	$(RUN) -m pytest $$(grep -l rclpy test/test_*.py) $(ARGS)
 
 bench: EXTRAS = dev,simulation,peers
 bench: venv

@@ -145,6 +145,16 @@ class Settings:
         return replace(self, **parsed)
 
 
+def parsed(name: str, value: object) -> Value:
+    """
+    Bring a value, or its text, to a parameter's type; its range is not looked at.
+
+    :param name: of a parameter
+    :raises InputError: for a wrong type
+    """
+    return _parse(Settings.__dataclass_fields__[name], value)
+
+
 def _parse(item: Field[Any], value: object) -> Value:
     """Bring a value, or its text, to the type of the parameter's default."""
     default: Any = item.default

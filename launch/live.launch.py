@@ -1,61 +1,74 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """The node on a live depth camera: `ros2 launch gr2t_ros live.launch.py --show-args`."""
+from dataclasses import fields
+
 from ament_index_python.packages import get_package_share_directory
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
+from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
+from gr2t_ros.settings import parsed, Settings
 from launch import LaunchDescription
+
+# preset: namespace of its camera, depth images, their camera_info
+TOPICS = {
+    'realsense_d400': ('/camera/camera', 'depth/image_rect_raw', 'depth/camera_info'),
+    'kinect_v1': ('/kinect', 'depth/image_raw', 'depth/camera_info'),
+    'azure_kinect': ('', 'depth/image_raw', 'depth/camera_info'),
+    'zed': ('/zed/zed_node', 'depth/depth_registered', 'depth/camera_info'),
+}
 
 
 def generate_launch_description():
     """Start gr2t_node, and RViz where asked."""
+    arguments = {
+        'preset': ('gr2t', f'{", ".join(TOPICS)}, tabletop_scan, room_scan; gr2t: the defaults'),
+        'params_file': ('', 'A parameter file of your own; wins over the preset'),
+        'camera': ('', 'Namespace of the camera; empty: as its driver names it'),
+        'depth_topic': ('', 'Depth images; empty: as the preset\'s driver names them'),
+        'camera_info_topic': ('', 'Their camera_info; empty: likewise'),
+        'pose_topic': ('pose', 'Poses, where pose_source is not tf'),
+        'use_sim_time': ('false', 'Take the time from /clock'),
+        'rviz': ('false', 'Also start RViz'),
+    }
+    parameters = {
+        item.name: ('', f'Parameter; wins over the files. {item.metadata["help"]}')
+        for item in fields(Settings)}
+    return LaunchDescription([
+        *(DeclareLaunchArgument(name, default_value=default, description=description)
+          for name, (default, description) in {**arguments, **parameters}.items()),
+        OpaqueFunction(function=nodes),
+    ])
+
+
+def nodes(context):
+    """Return what is to be started, once the arguments have their values."""
+    def value(name):
+        return LaunchConfiguration(name).perform(context)
+
     config = get_package_share_directory('gr2t_ros') + '/config/'
-    camera = LaunchConfiguration('camera')
-    arguments = [
-        DeclareLaunchArgument(
-            'preset', default_value='gr2t',
-            description='Parameter file of the folder config, without .yaml'),
-        DeclareLaunchArgument(
-            'camera', default_value='/camera/camera', description='Namespace of the camera'),
-        DeclareLaunchArgument(
-            'depth_topic', default_value=[camera, '/depth/image_rect_raw'],
-            description='Depth images: 16UC1 or mono16 (millimetres) or 32FC1 (metres)'),
-        DeclareLaunchArgument(
-            'camera_info_topic', default_value=[camera, '/depth/camera_info'],
-            description='Their camera_info'),
-        DeclareLaunchArgument(
-            'pose_source', default_value='tf',
-            description='tf, or pose, pose_with_covariance, odometry, transform (a topic)'),
-        DeclareLaunchArgument(
-            'pose_topic', default_value='pose', description='Poses, where not from tf'),
-        DeclareLaunchArgument(
-            'world_frame', default_value='',
-            description='Frame of the map; empty: the root of the tf tree above the camera'),
-        DeclareLaunchArgument(
-            'snapshot_directory', default_value='~/gr2t_snapshots',
-            description='Folder of the PLY snapshots'),
-        DeclareLaunchArgument('rviz', default_value='false', description='Also start RViz'),
-    ]
-    # what follows the preset wins over it
-    values = ('pose_source', 'world_frame', 'snapshot_directory')
+    camera, depth, info = TOPICS.get(value('preset'), TOPICS['realsense_d400'])
+    camera = value('camera').rstrip('/') or camera
+    files = [f'{config}{value("preset")}.yaml', value('params_file')]
+    given = {item.name: parsed(item.name, value(item.name))
+             for item in fields(Settings) if value(item.name)}
+    # a text that looks like a number would become one
+    given = {name: ParameterValue(item, value_type=str) if isinstance(item, str) else item
+             for name, item in given.items()}
+    given['use_sim_time'] = value('use_sim_time').lower() == 'true'
     node = Node(
         package='gr2t_ros', executable='gr2t_node', name='gr2t', output='screen',
-        parameters=[
-            [config, LaunchConfiguration('preset'), '.yaml'],
-            {name: ParameterValue(LaunchConfiguration(name), value_type=str)
-             for name in values},
-        ],
+        parameters=[*filter(None, files), given],  # the later win
         remappings=[
-            ('depth/image', LaunchConfiguration('depth_topic')),
-            ('depth/camera_info', LaunchConfiguration('camera_info_topic')),
-            ('pose', LaunchConfiguration('pose_topic')),
+            ('depth/image', value('depth_topic') or f'{camera}/{depth}'),
+            ('depth/camera_info', value('camera_info_topic') or f'{camera}/{info}'),
+            ('pose', value('pose_topic')),
         ])
-    rviz = Node(
+    if value('rviz').lower() != 'true':
+        return [node]
+    frame = value('world_frame')
+    return [node, Node(
         package='rviz2', executable='rviz2', output='screen',
-        arguments=['-d', config + 'gr2t.rviz'],
-        condition=IfCondition(LaunchConfiguration('rviz')))
-    return LaunchDescription([*arguments, node, rviz])
+        arguments=['-d', config + 'gr2t.rviz', *(('-f', frame) if frame else ())])]

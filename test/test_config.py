@@ -3,10 +3,16 @@
 """Parameter files, displays, the Fast DDS profile and launch files agree with the node."""
 import argparse
 import ast
+from collections.abc import Callable
 from dataclasses import fields
 from importlib.util import module_from_spec, spec_from_file_location
+import json
 from pathlib import Path
+import re
+import runpy
+import sys
 from types import ModuleType
+from typing import Any
 import xml.etree.ElementTree as ElementTree
 
 import numpy as np
@@ -176,21 +182,10 @@ def test_the_fast_dds_profile_holds_large_messages() -> None:
 
 @pytest.mark.parametrize('path', LAUNCH, ids=lambda path: path.name)
 def test_launch_files_parse(path: Path) -> None:
-    """All that can be told of them without the package launch, of which there is no wheel."""
+    """All that can be told of replay.launch.py without the package launch, which has no wheel."""
     tree = ast.parse(path.read_text(), str(path))
     assert 'generate_launch_description' in {
         item.name for item in tree.body if isinstance(item, ast.FunctionDef)}
-    names = {
-        call.args[0].value for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'LaunchConfiguration'
-        and isinstance(call.args[0], ast.Constant)}
-    declared = {
-        call.args[0].value for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'DeclareLaunchArgument'}
-    assert names <= declared
-    given = {item.name for item in fields(Settings)} & declared
-    if 'live' in path.name:
-        assert given == {'pose_source', 'world_frame', 'snapshot_directory'}
 
 
 @pytest.mark.parametrize('path', LAUNCH, ids=lambda path: path.name)
@@ -199,3 +194,95 @@ def test_launch_files_load(path: Path) -> None:
     from launch.launch_description_sources import get_launch_description_from_python_launch_file
     description = get_launch_description_from_python_launch_file(str(path))
     assert description.entities
+
+
+class Recorded:
+    """Stands for each class of launch: keeps what it is called with."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self.args, self.kwargs = args, kwargs
+
+    def perform(self, context: dict[str, str]) -> str:
+        """Return an argument's value; an unknown one is an error."""
+        return context[self.args[0]]
+
+
+@pytest.fixture
+def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
+    """Return what calls live.launch.py with launch replaced; it returns what each node gets."""
+    classes = {
+        'launch': ['LaunchDescription'],
+        'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
+        'launch.substitutions': ['LaunchConfiguration'],
+        'launch_ros': [],
+        'launch_ros.actions': ['Node'],
+        'launch_ros.parameter_descriptions': ['ParameterValue'],
+        'ament_index_python': [],
+        'ament_index_python.packages': ['get_package_share_directory'],
+    }
+    for name, members in classes.items():
+        module = ModuleType(name)
+        for member in members:
+            setattr(module, member, type(member, (Recorded,), {}))
+        monkeypatch.setitem(sys.modules, name, module)
+    sys.modules['ament_index_python.packages'].get_package_share_directory = (  # type: ignore
+        lambda _: str(PROJECT))
+
+    def start(**given: str) -> list[dict[str, Any]]:
+        module = runpy.run_path(str(PROJECT / 'launch' / 'live.launch.py'))
+        entities = module['generate_launch_description']().args[0]
+        context = {
+            item.args[0]: item.kwargs['default_value'] for item in entities
+            if type(item).__name__ == 'DeclareLaunchArgument'}
+        assert given.keys() <= context.keys()
+        return [node.kwargs for node in module['nodes']({**context, **given})]
+
+    return start
+
+
+@pytest.mark.parametrize('preset', [*PRESETS, 'gr2t'])
+def test_a_preset_brings_its_file_and_its_topics(
+    preset: str, live: Callable[..., list[dict[str, Any]]]
+) -> None:
+    """The topics are those that its file names; scenes take a RealSense's."""
+    node, = live(preset=preset)
+    file, values = node['parameters']
+    assert Path(file) == CONFIG / f'{preset}.yaml'
+    assert values == {'use_sim_time': False}
+    topics = dict(node['remappings'])
+    named = re.findall(r'^#.* (/[\w/]+)$', (CONFIG / f'{preset}.yaml').read_text(), re.M)
+    assert [topics['depth/image'], topics['depth/camera_info']] == (named or [
+        '/camera/camera/depth/image_rect_raw', '/camera/camera/depth/camera_info'])
+
+
+def test_what_is_given_wins(live: Callable[..., list[dict[str, Any]]]) -> None:
+    """Over the user's file, which wins over the preset."""
+    node, rviz = live(
+        preset='zed', rviz='true', camera='/zed2', params_file='mine.yaml', depth_max='4',
+        world_frame='12', camera_info_topic='/info', use_sim_time='true')
+    preset, file, values = node['parameters']
+    assert preset.endswith('zed.yaml') and file == 'mine.yaml'
+    text = values.pop('world_frame')
+    assert (text.args, text.kwargs) == (('12',), {'value_type': str})
+    assert values == {'depth_max': 4.0, 'use_sim_time': True}
+    assert type(values['depth_max']) is float
+    assert dict(node['remappings']) == {
+        'depth/image': '/zed2/depth/depth_registered', 'depth/camera_info': '/info',
+        'pose': 'pose'}
+    assert Path(rviz['arguments'][1]).is_file() and rviz['arguments'][2:] == ['-f', '12']
+
+
+def test_the_foxglove_layout_shows_the_map() -> None:
+    """As an exported layout: panels, and a tree that holds all of them."""
+    content = json.loads((CONFIG / 'foxglove_layout.json').read_text())
+    panels = content['configById']
+
+    def leaves(node: Any) -> list[str]:
+        if isinstance(node, str):
+            return [node]
+        return leaves(node['first']) + leaves(node['second'])
+
+    assert sorted(leaves(content['layout'])) == sorted(panels)
+    view, = (panel for name, panel in panels.items() if name.startswith('3D!'))
+    assert all(view['topics'][topic]['visible'] for topic in ('/gr2t/mesh', '/gr2t/points'))
+    assert view['topics']['/gr2t/points']['colorField'] == 'likelihood'

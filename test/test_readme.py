@@ -180,10 +180,9 @@ def test_command_names_what_exists(command: str, request: pytest.FixtureRequest)
 def check_launch(package: str, file: str, *arguments: str) -> None:
     """Compare a call of ros2 launch with the arguments that the file declares."""
     assert package == 'gr2t_ros'
-    tree = ast.parse((ROOT / 'launch' / file).read_text())
-    declared = {
-        call.args[0].value for call in ast.walk(tree)
-        if isinstance(call, ast.Call) and getattr(call.func, 'id', '') == 'DeclareLaunchArgument'}
+    declared = {item.name for item in fields(Settings)} | {
+        node.value for node in ast.walk(ast.parse((ROOT / 'launch' / file).read_text()))
+        if isinstance(node, ast.Constant)}
     for name, value in (item.split(':=') for item in arguments):
         assert name in declared
         if name == 'preset':
