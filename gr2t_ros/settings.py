@@ -116,6 +116,9 @@ class Settings:
         unit='px', low=1, high=64)
     snapshot_directory: str = _parameter(
         '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.')
+    snapshot_period: float = _parameter(
+        0.0, 'Also save a snapshot so often, where the map has changed; 0: never.',
+        unit='s', low=0.0, high=86400.0)
     snapshot_on_exit: bool = _parameter(
         False, 'Also save a snapshot when the node is told to stop.')
 

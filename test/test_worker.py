@@ -15,9 +15,10 @@ from scenes_for_tests import looking_at_origin, plane_view
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.reconstruction import Reconstruction, Update
 from gr2t_ros.core.view import View
-from gr2t_ros.errors import InputError
+from gr2t_ros.errors import Gr2tError, InputError
+from gr2t_ros.io import snapshots
 from gr2t_ros.io.bags import Bag
-from gr2t_ros.io.ply import read
+from gr2t_ros.io.ply import read, write_views, Written
 from gr2t_ros.ros.worker import Worker
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
@@ -192,7 +193,7 @@ def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
     assert rig.outputs.cleared == ['map']
     rig.feed()
     rig.wait(lambda: rig.integrated == 2 * COUNT, 'the frames after the reset')
-    assert rig.worker.snapshot().result(LIMIT).vertices > 0
+    assert rig.worker.snapshot().result(LIMIT).file.vertices > 0
 
 
 def test_reset_and_pause_do_not_wait_for_a_frame(
@@ -224,11 +225,80 @@ def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path)
     rig = make()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
-    paths = [rig.worker.snapshot().result(LIMIT).path for _ in range(3)]
+    paths = [rig.worker.snapshot().result(LIMIT).file.path for _ in range(3)]
     assert len(set(paths)) == 3
     for path in paths:
         assert path.parent == tmp_path / 'snapshots'
         assert np.abs(read(path).mesh.vertices[:, 2]).max() < 0.02
+
+
+def test_no_frame_waits_for_a_snapshot(
+    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames go on while the file is written, which holds the map as it was when asked for."""
+    go, busy = threading.Event(), threading.Event()
+
+    def slow(*arguments: Any, **options: Any) -> Written:
+        busy.set()
+        assert go.wait(LIMIT)
+        return write_views(*arguments, **options)
+
+    rig = make(keyframe_translation=0.0)
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
+    monkeypatch.setattr(snapshots, 'write_views', slow)
+    answer, later = rig.worker.snapshot(), rig.worker.snapshot()
+    assert busy.wait(LIMIT)
+    rig.feed()
+    rig.wait(lambda: rig.integrated == 2 * COUNT, 'frames during the snapshot')
+    rig.worker.reset()
+    go.set()
+    saved = answer.result(LIMIT)
+    assert set(read(saved.file.path).vertex_view) == set(range(COUNT))
+    likelihood = read(saved.file.path).mesh.vertex_likelihood
+    assert saved.likelihood == (likelihood.min(), likelihood.max())
+    assert str(saved).startswith(f'{saved.file.path}: {saved.file.vertices} vertices, ')
+    with pytest.raises(InputError, match='nothing to save'):
+        later.result(LIMIT)
+
+
+def test_a_stop_gives_up_what_is_being_written(
+    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """No part of a file stays; all who wait are told."""
+    busy = threading.Event()
+    meshes = Reconstruction.meshes
+
+    def slow(self: Reconstruction, stride: int = 1) -> Any:
+        busy.set()
+        for item in meshes(self, stride):
+            rig.wait(lambda: rig.worker._stop, 'the stop')
+            yield item
+
+    monkeypatch.setattr(Reconstruction, 'meshes', slow)
+    rig = make()
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
+    answers = [rig.worker.snapshot(), rig.worker.snapshot()]
+    assert busy.wait(LIMIT)
+    rig.worker.stop()
+    for answer in answers:
+        with pytest.raises(Gr2tError, match='told to stop'):
+            answer.result(LIMIT)
+    assert list(tmp_path.glob('snapshots/*')) == []
+
+
+def test_periodic_snapshots_of_what_is_new(make: Callable[..., Rig], tmp_path: Path) -> None:
+    rig = make(snapshot_period=0.01)
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.said('periodic snapshot'), 'a snapshot')
+    rig.feed()
+    rig.wait(lambda: rig.integrated == 2 * COUNT, 'more frames')
+    rig.wait(lambda: rig.worker._saved == 2 * COUNT, 'a snapshot of them')
+    rig.worker.stop()
+    assert rig.said('periodic snapshot') <= 2 * COUNT, 'none without new frames'
+    assert rig.said('periodic snapshot: /') == len(list(tmp_path.glob('snapshots/*.ply')))
 
 
 def test_a_snapshot_on_exit_where_asked(make: Callable[..., Rig], tmp_path: Path) -> None:

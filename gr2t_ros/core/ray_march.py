@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import ModuleType
 
 import numpy as np
@@ -61,6 +61,12 @@ class Rays:
     def converged(self) -> NDArray[np.bool_]:
         """Return which rays have found their maximum, (n,)."""
         return np.equal(self.status, Status.CONVERGED)
+
+    def copy(self) -> Rays:
+        """Return rays with results of their own."""
+        return replace(
+            self, depth=self.depth.copy(), total=self.total.copy(), status=self.status.copy(),
+            iterations=self.iterations.copy(), marched=self.marched.copy())
 
     @property
     def origin(self) -> Doubles:

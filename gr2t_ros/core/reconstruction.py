@@ -9,7 +9,8 @@ those climb again to their maximum, and the meshes of their keyframes follow.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
+from copy import copy
 from dataclasses import dataclass, field, replace
 import os
 from time import perf_counter
@@ -22,6 +23,7 @@ from ..settings import Settings
 from .blocks import new_blocks, with_keys
 from .camera import Camera
 from .exact_density import ExactDensity
+from .frozen import frozen, Room
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .view import View
 from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
@@ -38,12 +40,20 @@ class Keyframe:
 
     :param blocks: the lattice's blocks that its rays need; None with the exact density
     :param checked: the density's change up to which all its rays are right
+    :param shared: whether a frozen map has the same rays
     """
 
     view: View
     rays: Rays
     blocks: NDArray[np.int32] | None
     checked: int = -1
+    shared: bool = False
+
+    def own_rays(self) -> Rays:
+        """Return the rays for a change, which is not seen where they are shared."""
+        if self.shared:
+            self.rays, self.shared = self.rays.copy(), False
+        return self.rays
 
 
 @dataclass(frozen=True)
@@ -85,7 +95,7 @@ class Reconstruction:
         self.keyframes: list[Keyframe] = []
         self._density: Density | None = None
         self._noticed: set[str] = set()
-        self._pool = ThreadPoolExecutor(
+        self._pool: Executor | None = ThreadPoolExecutor(
             settings.threads or os.cpu_count() or 1, thread_name_prefix='gr2t')
 
     @property
@@ -170,9 +180,28 @@ class Reconstruction:
             return 0.0
         return float(np.percentile(likely, ROBUST_MAXIMUM)) / self.density.size
 
+    def frozen(self, room: Room) -> Reconstruction:
+        """
+        Return the map as it is now, for another thread, while this one goes on.
+
+        It can finish and be meshed, in that thread alone, and takes no views.
+
+        :param room: of frozen.room_for; most of the memory that it takes
+        """
+        twin = copy(self)
+        twin._pool = None
+        if self._density is not None:
+            self._density.refresh(self._pool)
+            twin._density = frozen(self._density, room)
+        for keyframe in self.keyframes:
+            keyframe.shared = True
+        twin.keyframes = [copy(keyframe) for keyframe in self.keyframes]
+        return twin
+
     def close(self) -> None:
         """End the threads."""
-        self._pool.shutdown()
+        if self._pool is not None:
+            self._pool.shutdown()
 
     def _new_density(self, view: View) -> tuple[Density, str]:
         """Return an empty density for the first view, and what to say of it."""
@@ -229,7 +258,7 @@ class Reconstruction:
         while waiting:
             number = waiting[0]
             keyframe = self.keyframes[number]
-            rays = keyframe.rays
+            rays = keyframe.own_rays()
             for begin in range(0, len(rays.pixels), _SLICE):
                 if number != new and perf_counter() >= deadline:
                     break

@@ -3,35 +3,85 @@
 """Snapshots: the map as a PLY file with a new name each time."""
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 import time
 
 import numpy as np
 
 from ..core.reconstruction import Reconstruction
-from ..errors import InputError
+from ..core.view_mesh import ViewMesh
+from ..errors import Gr2tError, InputError
 from .ply import write_views, Written
 
+_STEP = 0.2  # s of marching between two looks at whether to go on
 
-def save_snapshot(reconstruction: Reconstruction, directory: str, colour_map: str) -> Written:
+
+@dataclass(frozen=True)
+class Snapshot:
     """
-    Write all keyframes' meshes into a new file, named after the time.
+    What was saved.
+
+    :param file: the path and the counts
+    :param likelihood: least and largest of the vertices, 1 / (px^2 m)
+    """
+
+    file: Written
+    likelihood: tuple[float, float]
+
+    def __str__(self) -> str:
+        """Return the path, ': ' and what the file holds."""
+        file = self.file
+        stride = f', every {file.stride}th ray' if file.stride > 1 else ''
+        return (
+            f'{file.path}: {file.vertices} vertices, {file.edges} edges, {file.faces} faces'
+            f'{stride}, likelihood {self.likelihood[0]:.3g} to {self.likelihood[1]:.3g} '
+            '/ (px^2 m)')
+
+
+def save_snapshot(
+    reconstruction: Reconstruction, directory: str, colour_map: str,
+    interrupted: Callable[[], bool] = lambda: False,
+) -> Snapshot:
+    """
+    March all rays that wait, and write all keyframes' meshes into a new file named after the time.
 
     Names are never used twice, since viewers keep a mesh by its name.
 
     :param directory: made when needed; ~ is the home
     :param colour_map: one of the choices of Settings.colour_map
+    :param interrupted: asked all the while; True: leave no file and raise
     :raises InputError: if there is nothing to save yet
-    :raises Gr2tError: if the file cannot be written
+    :raises Gr2tError: if the file cannot be written, or the writing was interrupted
     """
     if not reconstruction.keyframes:
         raise InputError('there is nothing to save yet: no frame has been integrated')
-    path = new_path(Path(directory).expanduser())
+
+    def go_on() -> None:
+        if interrupted():
+            raise Gr2tError('interrupted: the node was told to stop')
+
+    ranges: list[tuple[float, float]] = []
+
+    def meshes(stride: int) -> Iterator[tuple[int, ViewMesh]]:
+        ranges.clear()
+        for number, mesh in reconstruction.meshes(stride):
+            go_on()
+            if len(mesh.vertices):
+                likelihood = mesh.vertex_likelihood
+                ranges.append((float(likelihood.min()), float(likelihood.max())))
+            yield number, mesh
+
+    while reconstruction.finish(_STEP).waiting:
+        go_on()
     expected = sum(
         int(np.count_nonzero(keyframe.rays.converged)) for keyframe in reconstruction.keyframes)
-    return write_views(
-        path, reconstruction.meshes, reconstruction.colour_scale(), colour_map,
+    file = write_views(
+        new_path(Path(directory).expanduser()), meshes, reconstruction.colour_scale(), colour_map,
         expected_vertices=expected)
+    low, high = zip(*ranges) if ranges else ((0.0,), (0.0,))
+    return Snapshot(file, (min(low), max(high)))
 
 
 def new_path(directory: Path) -> Path:

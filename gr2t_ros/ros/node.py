@@ -5,29 +5,27 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from concurrent.futures import Future
 import signal
 import sys
 import threading
-from typing import Any
+import time
 
 import rclpy
-from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
-import rclpy.task
 from rclpy.utilities import remove_ros_args
-from std_srvs.srv import SetBool, Trigger
 
 from ..core.reconstruction import warm_up
 from ..errors import InputError
 from .parameters import read_parameters, table
 from .publishers import MapPublishers
+from .services import Services
 from .subscriptions import check_source, rectified, Subscriptions
-from .worker import describe, Worker
+from .worker import Worker
 
 NAME = 'gr2t'
+_LAST_ANSWERS = 1.0  # s at the end for telling those who wait for a snapshot
 
 
 class Gr2tNode(Node):
@@ -47,7 +45,7 @@ class Gr2tNode(Node):
             self.settings, MapPublishers(self, self.settings), self.get_logger(),
             rectified=rectified(self))
         self.inputs = Subscriptions(self, self.settings, self.worker.intake)
-        self._advertise_services()
+        self.offered = Services(self, self.worker, self._pause)
         self.worker.start()
 
     def _log_settings(self) -> None:
@@ -58,50 +56,9 @@ class Gr2tNode(Node):
         self.get_logger().info('compiling the kernels, or loading them from the cache')
         self.get_logger().info(f'kernels are ready after {warm_up(self.settings):.1f} s')
 
-    def _advertise_services(self) -> None:
-        self.create_service(
-            Trigger, '~/save_snapshot', self._on_save_snapshot,
-            callback_group=ReentrantCallbackGroup())
-        self.create_service(Trigger, '~/reset', self._on_reset)
-        self.create_service(SetBool, '~/pause', self._on_pause)
-        self._answered = self.create_guard_condition(lambda: None)
-
-    async def _on_save_snapshot(
-        self, _: Trigger.Request, response: Trigger.Response
-    ) -> Trigger.Response:
-        """Answer once the worker has written the file; other callbacks go on meanwhile."""
-        answer: Any = rclpy.task.Future()
-
-        def wake(done: Future[Any]) -> None:
-            answer.set_result(done)
-            self._answered.trigger()
-
-        self.worker.snapshot().add_done_callback(wake)
-        done: Future[Any] = await answer
-        error = done.exception()
-        response.success = error is None
-        if error:
-            response.message = str(error)
-            self.get_logger().warning(f'no snapshot: {response.message}')
-        else:
-            response.message = describe(done.result())
-            self.get_logger().info(f'snapshot: {response.message}')
-        return response
-
-    def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self.worker.reset()
-        response.success = True
-        response.message = 'the map is empty'
-        self.get_logger().info(f'reset: {response.message}')
-        return response
-
-    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self.inputs.paused = request.data
-        self.worker.intake.pause(request.data)
-        response.success = True
-        response.message = 'paused: images are ignored' if request.data else 'running'
-        self.get_logger().info(f'pause: {response.message}')
-        return response
+    def _pause(self, paused: bool) -> None:
+        self.inputs.paused = paused
+        self.worker.intake.pause(paused)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -142,6 +99,9 @@ def _spin(node: Gr2tNode, stop: threading.Event) -> None:
             executor.spin_once(timeout_sec=1.0)
     finally:
         node.worker.stop()
+        end = time.monotonic() + _LAST_ANSWERS
+        while node.offered.unanswered and time.monotonic() < end:
+            executor.spin_once(timeout_sec=0.1)
         node.get_logger().info(node.worker.summary())
         executor.shutdown()
         node.destroy_node()

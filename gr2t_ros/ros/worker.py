@@ -5,17 +5,17 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 import threading
 import time
 import traceback
 from typing import Any, Protocol
 
+from ..core.frozen import room_for
 from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
-from ..errors import FrameError
-from ..io.ply import Written
-from ..io.snapshots import save_snapshot
+from ..errors import FrameError, Gr2tError
+from ..io.snapshots import save_snapshot, Snapshot
 from ..settings import Settings
 from .intake import Intake
 
@@ -82,6 +82,10 @@ class Worker:
         self._orders: deque[Callable[[], None]] = deque()
         self._stop = False
         self._thread = threading.Thread(target=self._run, name='worker')
+        # one snapshot after the other: each has a copy of the map in memory
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix='snapshot')
+        self._saved = 0  # views that were in the map at the last periodic snapshot
+        self._save_after = time.monotonic()
 
         self._told: set[str] = set()
         self._seconds: Counter[str] = Counter()
@@ -91,11 +95,16 @@ class Worker:
         self._thread.start()
 
     def stop(self) -> None:
-        """End after the step at hand, with a snapshot where settings ask for one."""
+        """
+        End after the step at hand, with a snapshot where settings ask for one.
+
+        A snapshot that is being written is given up, so that it leaves no file.
+        """
         with self._wake:
             self._stop = True
             self._wake.notify()
         self._thread.join()
+        self._writer.shutdown()
 
     @property
     def alive(self) -> bool:
@@ -109,20 +118,13 @@ class Worker:
             self._orders.appendleft(self._reset)
             self._wake.notify()
 
-    def snapshot(self) -> Future[Written]:
-        """Save the map after the step at hand; the future may hold a Gr2tError."""
-        answer: Future[Written] = Future()
+    def snapshot(self) -> Future[Snapshot]:
+        """
+        Save the map as it is after the step at hand, all its rays marched; frames go on meanwhile.
 
-        def order() -> None:
-            try:
-                answer.set_result(self._save())
-            except Exception as error:  # whatever it is, the caller must get an answer
-                answer.set_exception(error)
-
-        with self._wake:
-            self._orders.append(order)
-            self._wake.notify()
-        return answer
+        :return: holds a Gr2tError if nothing was saved
+        """
+        return self._writer.submit(self._save_copy)
 
     def summary(self) -> str:
         """Return what became of the images, and how long it took, as text."""
@@ -151,11 +153,12 @@ class Worker:
             try:
                 step()
                 self._publish()
+                self._save_now_and_then()
             except Exception as error:  # the thread must outlive whatever one step does
                 self._fail('the worker', error)
         if self._settings.snapshot_on_exit:
             try:
-                self._log.info(f'snapshot: {describe(self._save())}')
+                self._log.info(f'snapshot: {self._save(self._reconstruction)}')
             except Exception as error:
                 self._log.error(f'no snapshot: {error}')
         self._reconstruction.close()
@@ -166,10 +169,10 @@ class Worker:
             self._wake.wait_for(
                 lambda: self._stop or self._orders or self._views or self.intake.queued,
                 timeout=0.0 if self.waiting_rays else 1.0 / self._settings.publish_rate)
-            if self._stop:
-                return None
             if self._orders:
                 return self._orders.popleft()
+            if self._stop:
+                return None
             if self._views:
                 view = self._views.popleft()
                 return lambda: self._integrate(view)
@@ -218,10 +221,48 @@ class Worker:
         self._outputs.publish(
             self._reconstruction, self.intake.world.frame, self._stamp_ns, self._in_map)
 
-    def _save(self) -> Written:
-        self._account(self._reconstruction.finish())
+    def _save_now_and_then(self) -> None:
+        """Begin a snapshot every snapshot_period, if there is something new."""
+        now = time.monotonic()
+        period = self._settings.snapshot_period
+        if not period or now < self._save_after + period or self._in_map == self._saved:
+            return
+        self._save_after, self._saved = float('inf'), self._in_map
+
+        def report(answer: Future[Snapshot]) -> None:
+            # the next period begins when this one is written: slow disks get fewer, not a queue
+            self._save_after = time.monotonic()
+            if error := answer.exception():
+                self._log.error(f'no periodic snapshot: {error}')
+            else:
+                self._log.info(f'periodic snapshot: {answer.result()}')
+
+        self.snapshot().add_done_callback(report)
+
+    def _save_copy(self) -> Snapshot:
+        """Save a copy of the map, in the writer's thread; the worker stops for the copying."""
+        room = room_for(self._reconstruction.density) if self._reconstruction.keyframes else {}
+        copy: Future[Reconstruction] = Future()
+
+        def order() -> None:
+            try:
+                copy.set_result(self._reconstruction.frozen(room))
+            except Exception as error:  # whatever it is, who waits must get an answer
+                copy.set_exception(error)
+
+        with self._wake:
+            if self._stop:
+                raise Gr2tError('the node was told to stop')
+            self._orders.append(order)
+            self._wake.notify()
+        return self._save(copy.result(), lambda: self._stop)
+
+    def _save(
+        self, reconstruction: Reconstruction, interrupted: Callable[[], bool] = lambda: False
+    ) -> Snapshot:
         return save_snapshot(
-            self._reconstruction, self._settings.snapshot_directory, self._settings.colour_map)
+            reconstruction, self._settings.snapshot_directory, self._settings.colour_map,
+            interrupted)
 
     def _reset(self) -> None:
         for view in self._views:
@@ -229,7 +270,7 @@ class Worker:
         self._views.clear()
         self._reconstruction.close()
         self._reconstruction = Reconstruction(self._settings)
-        self._in_map = 0
+        self._in_map = self._saved = 0
         self.waiting_rays = 0
         if self.intake.world.frame:
             self._outputs.clear(self.intake.world.frame)
@@ -245,11 +286,3 @@ class Worker:
         if place not in self._told:
             self._told.add(place)
             self._log.error(place)
-
-
-def describe(written: Written) -> str:
-    """Return where a snapshot is and what it holds."""
-    stride = f', every {written.stride}th ray' if written.stride > 1 else ''
-    return (
-        f'{written.path}: {written.vertices} vertices, {written.edges} edges, '
-        f'{written.faces} faces{stride}')
