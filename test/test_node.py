@@ -72,6 +72,7 @@ def test_map_from_a_played_bag(
                 deserialize_message(clouds[-1], PointCloud2).header.stamp
             ).nanoseconds == last_stamp, 'a cloud with the last image')
 
+        assert 'the map begins, in the frame map' in node.log
         _check_cloud(deserialize_message(clouds[-1], PointCloud2))
         markers = _markers(arrays)
         for marker in markers.values():

@@ -98,6 +98,19 @@ def test_links_lead_to_files_and_headings(file: str) -> None:
         assert not heading or heading in headings, link
 
 
+def test_every_reason_for_a_dropped_image_is_explained() -> None:
+    page = (ROOT / 'docs' / 'nothing_shows_up.md').read_text(encoding='utf-8')
+    explained = set(re.findall(r'^\| `(\w+)` \|', page, re.M))
+    source = ''.join(
+        path.read_text(encoding='utf-8') for path in (ROOT / 'gr2t_ros').rglob('*.py'))
+    reasons = {
+        reason for call in (
+            r"(?:FrameError|NotYet)\(\s*'(\w+)'", r"\.lost\['(\w+)'\]", r"\.drop\(\w+, '(\w+)'\)")
+        for reason in re.findall(call, source)}
+    assert len(reasons) > 10
+    assert explained == reasons - {'empty_map'}  # of a snapshot
+
+
 def test_parameters_that_it_sets_exist() -> None:
     known = {item.name for item in fields(Settings)}
     for name, value in re.findall(r'-p (\w+):=(\S+)', README):

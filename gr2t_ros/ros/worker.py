@@ -203,6 +203,10 @@ class Worker:
             return
         self.intake.cameras[view.camera_name].integrated += 1
         self._in_map += 1
+        if self._in_map == 1:
+            self._log.info(
+                f'the map begins, in the frame {self.intake.world.frame}: RViz\'s fixed frame '
+                'must be it, or be connected with it')
         self._stamp_ns = view.stamp_ns
         self._account(update)
 
