@@ -54,9 +54,11 @@ def nodes(context):
     files = [f'{config}{value("preset")}.yaml', value('params_file')]
     given = {item.name: parsed(item.name, value(item.name))
              for item in fields(Settings) if value(item.name)}
-    # a text that looks like a number would become one
-    given = {name: ParameterValue(item, value_type=str) if isinstance(item, str) else item
-             for name, item in given.items()}
+    for name, item in given.items():
+        if isinstance(item, str):  # one that looks like a number would become one
+            given[name] = ParameterValue(item, value_type=str)
+        elif isinstance(item, tuple):
+            given[name] = list(item)
     given['use_sim_time'] = value('use_sim_time').lower() == 'true'
     node = Node(
         package='gr2t_ros', executable='gr2t_node', name='gr2t', output='screen',

@@ -182,7 +182,7 @@ def test_the_fast_dds_profile_holds_large_messages() -> None:
 
 @pytest.mark.parametrize('path', LAUNCH, ids=lambda path: path.name)
 def test_launch_files_parse(path: Path) -> None:
-    """All that can be told of replay.launch.py without the package launch, which has no wheel."""
+    """All that can be told of some without the package launch, which has no wheel."""
     tree = ast.parse(path.read_text(), str(path))
     assert 'generate_launch_description' in {
         item.name for item in tree.body if isinstance(item, ast.FunctionDef)}
@@ -208,28 +208,37 @@ class Recorded:
 
 
 @pytest.fixture
-def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]:
-    """Return what calls live.launch.py with launch replaced; it returns what each node gets."""
+def launched(monkeypatch: pytest.MonkeyPatch) -> Callable[[str], dict[str, Any]]:
+    """Return what runs a launch file, with launch replaced, and returns its names."""
     classes = {
         'launch': ['LaunchDescription'],
-        'launch.actions': ['DeclareLaunchArgument', 'OpaqueFunction'],
+        'launch.actions': [
+            'DeclareLaunchArgument', 'ExecuteProcess', 'IncludeLaunchDescription',
+            'OpaqueFunction'],
+        'launch.launch_description_sources': ['PythonLaunchDescriptionSource'],
         'launch.substitutions': ['LaunchConfiguration'],
         'launch_ros': [],
         'launch_ros.actions': ['Node'],
         'launch_ros.parameter_descriptions': ['ParameterValue'],
         'ament_index_python': [],
-        'ament_index_python.packages': ['get_package_share_directory'],
+        'ament_index_python.packages': [],
     }
     for name, members in classes.items():
         module = ModuleType(name)
         for member in members:
             setattr(module, member, type(member, (Recorded,), {}))
         monkeypatch.setitem(sys.modules, name, module)
-    sys.modules['ament_index_python.packages'].get_package_share_directory = (  # type: ignore
-        lambda _: str(PROJECT))
+    monkeypatch.setattr(
+        sys.modules['ament_index_python.packages'], 'get_package_share_directory',
+        lambda _: str(PROJECT), raising=False)
+    return lambda name: runpy.run_path(str(PROJECT / 'launch' / name))
 
+
+@pytest.fixture
+def live(launched: Callable[[str], dict[str, Any]]) -> Callable[..., list[dict[str, Any]]]:
+    """Return what calls live.launch.py with arguments; it returns what each node gets."""
     def start(**given: str) -> list[dict[str, Any]]:
-        module = runpy.run_path(str(PROJECT / 'launch' / 'live.launch.py'))
+        module = launched('live.launch.py')
         entities = module['generate_launch_description']().args[0]
         context = {
             item.args[0]: item.kwargs['default_value'] for item in entities
@@ -238,6 +247,20 @@ def live(monkeypatch: pytest.MonkeyPatch) -> Callable[..., list[dict[str, Any]]]
         return [node.kwargs for node in module['nodes']({**context, **given})]
 
     return start
+
+
+def test_a_recording_is_played_into_the_live_node(
+    launched: Callable[[str], dict[str, Any]]
+) -> None:
+    entities = launched('replay.launch.py')['generate_launch_description']().args[0]
+    by_class = {type(item).__name__: item for item in entities}
+    included = by_class['IncludeLaunchDescription'].args[0].args[0]
+    assert Path(included) == PROJECT / 'launch' / 'live.launch.py' and Path(included).is_file()
+    command = by_class['ExecuteProcess'].kwargs['cmd']
+    assert command[:3] == ['ros2', 'bag', 'play']
+    declared = {item.args[0] for item in entities if type(item).__name__.startswith('Declare')}
+    assert declared == {
+        item.args[0] for item in command if type(item).__name__ == 'LaunchConfiguration'}
 
 
 @pytest.mark.parametrize('preset', [*PRESETS, 'gr2t'])
