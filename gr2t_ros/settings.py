@@ -35,11 +35,18 @@ def _parameter(
     low: float | None = None,
     high: float | None = None,
     choices: tuple[str, ...] = (),
+    live: bool = False,
 ) -> Any:
+    """
+    Return a field of the table.
+
+    :param live: whether a running node lets it change
+    """
     return field(
         default=default,
-        metadata={'help': help, 'unit': unit, 'low': low, 'high': high, 'choices': choices},
-    )
+        metadata={
+            'help': help, 'unit': unit, 'low': low, 'high': high, 'choices': choices,
+            'live': live})
 
 
 @dataclass(frozen=True)
@@ -70,29 +77,29 @@ class Settings:
         1, 'March every n-th pixel of every n-th row.', unit='px', low=1, high=64)
     min_likelihood: float = _parameter(
         0.02, 'Vertices below this fraction of their view\'s 98th percentile are removed.',
-        low=0.0, high=1.0)
+        low=0.0, high=1.0, live=True)
     min_edge_likelihood: float = _parameter(
         0.5, 'Edges whose middle has less than this fraction of the larger of their two '
-        'vertices\' likelihoods are removed.', low=0.0, high=1.0)
+        'vertices\' likelihoods are removed.', low=0.0, high=1.0, live=True)
     keyframe_translation: float = _parameter(
         0.1, 'A frame this far from the last keyframe becomes one, and so owns a mesh.',
-        unit='m', low=0.0, high=100.0)
+        unit='m', low=0.0, high=100.0, live=True)
     keyframe_rotation: float = _parameter(
         0.17, 'A frame turned this far from the last keyframe becomes one.',
-        unit='rad', low=0.0, high=3.15)
+        unit='rad', low=0.0, high=3.15, live=True)
     max_keyframes: int = _parameter(
         1000, 'Keyframes kept; later ones still add to the density (reported).',
-        low=1, high=1_000_000)
+        low=1, high=1_000_000, live=True)
     remarch_budget: float = _parameter(
         0.02, 'Time per frame for marching older rays again; what is left waits, and is done '
-        'before a snapshot or at the end.', unit='s', low=0.0, high=60.0)
+        'before a snapshot or at the end.', unit='s', low=0.0, high=60.0, live=True)
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
 
     depth_min: float = _parameter(
-        0.1, 'Depths below are invalid.', unit='m', low=0.0, high=1000.0)
+        0.1, 'Depths below are invalid.', unit='m', low=0.0, high=1000.0, live=True)
     depth_max: float = _parameter(
-        5.0, 'Depths above are invalid.', unit='m', low=0.0, high=1000.0)
+        5.0, 'Depths above are invalid.', unit='m', low=0.0, high=1000.0, live=True)
     world_frame: str = _parameter(
         '', 'Frame the map is built in; empty: the root of the tf tree above the camera, or the '
         'pose topic\'s frame.')
@@ -108,19 +115,19 @@ class Settings:
 
     colour_map: str = _parameter(
         'turbo', 'Colours from low (blue) to high (red) likelihood.',
-        choices=('turbo', 'jet', 'coolwarm', 'viridis'))
+        choices=('turbo', 'jet', 'coolwarm', 'viridis'), live=True)
     publish_rate: float = _parameter(
-        2.0, 'Meshes published per second, at most.', unit='Hz', low=0.05, high=60.0)
+        2.0, 'Meshes published per second, at most.', unit='Hz', low=0.05, high=60.0, live=True)
     display_stride: int = _parameter(
         4, 'The published (not the saved) meshes use every n-th ray of every n-th row.',
-        unit='px', low=1, high=64)
+        unit='px', low=1, high=64, live=True)
     snapshot_directory: str = _parameter(
-        '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.')
+        '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.', live=True)
     snapshot_period: float = _parameter(
         0.0, 'Also save a snapshot so often, where the map has changed; 0: never.',
-        unit='s', low=0.0, high=86400.0)
+        unit='s', low=0.0, high=86400.0, live=True)
     snapshot_on_exit: bool = _parameter(
-        False, 'Also save a snapshot when the node is told to stop.')
+        False, 'Also save a snapshot when the node is told to stop.', live=True)
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -35,7 +35,8 @@ MARKDOWN_HEAD = """\
 
 Of `gr2t_node` and of the command line; scripts/write_parameters.py writes this page. Give them as
 `-p name:=value`, or in a file like [config/gr2t.yaml](../config/gr2t.yaml), which holds all with
-their defaults. A running node describes its own: `ros2 param describe /gr2t NAME`.
+their defaults. A running node describes its own: `ros2 param describe /gr2t NAME`. Those
+marked * can change while it runs (`ros2 param set /gr2t depth_max 3`), the others at its start.
 """
 
 PRESETS_HEAD = """\
@@ -70,7 +71,8 @@ def markdown_text() -> str:
         lines += [f'## {group}', '', '| Parameter | Default | Range | |', '|---|---|---|---|']
         for item in items:
             lines.append(
-                f'| `{item.name}` | {value_text(item.default)} | {_limits(item, ", ")} | '
+                f'| `{item.name}`{" *" * item.metadata["live"]} | {value_text(item.default)} | '
+                f'{_limits(item, ", ")} | '
                 f'{item.metadata["help"]} |')
         lines.append('')
     return '\n'.join(lines) + '\n' + PRESETS_HEAD + '\n'.join(map(_preset, presets())) + '\n'

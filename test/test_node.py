@@ -182,7 +182,12 @@ def test_all_parameters_are_described(
 ) -> None:
     """`ros2 param describe` shows help, unit and range; what cannot change says so."""
     from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-    from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
+    from rcl_interfaces.srv import (
+        DescribeParameters,
+        GetParameters,
+        ListParameters,
+        SetParameters,
+    )
     with NodeProcess(isolation, tmp_path, '-p', 'depth_max:=4') as node:
         names = observer.call(ListParameters, 'list_parameters').result.names
         assert {'depth_max', 'world_frame', 'publish_rate', 'snapshot_on_exit'} <= set(names)
@@ -192,11 +197,29 @@ def test_all_parameters_are_described(
         assert depth_max.description == 'Depths above are invalid. [m]'
         assert depth_max.floating_point_range[0].to_value == 1000.0
         assert 'odometry' in pose_source.additional_constraints
-        new = Parameter(name='depth_max', value=ParameterValue(
-            type=ParameterType.PARAMETER_DOUBLE, double_value=3.0))
-        result = observer.call(SetParameters, 'set_parameters', parameters=[new]).results[0]
-        assert not result.successful
-        assert 'read-only' in result.reason
+        assert not depth_max.read_only and pose_source.read_only
+
+        def change(name: str, **value: object) -> str:
+            """Return why a parameter did not change."""
+            new = Parameter(name=name, value=ParameterValue(**value))
+            result = observer.call(SetParameters, 'set_parameters', parameters=[new]).results[0]
+            assert result.successful == (not result.reason)
+            return result.reason
+
+        whole, text = ParameterType.PARAMETER_INTEGER, ParameterType.PARAMETER_STRING
+        assert change('depth_max', type=whole, integer_value=3) == ''
+        assert change('colour_map', type=text, string_value='viridis') == ''
+        node.wait_for("parameter colour_map is now 'viridis'")
+        assert 'parameter depth_max is now 3.0' in node.log
+        assert 'must lie in [0, 1000] m, not -1' in change(
+            'depth_max', type=whole, integer_value=-1)
+        assert 'must be below depth_max (3 m)' in change(
+            'depth_min', type=whole, integer_value=4)
+        assert change('density', type=text, string_value='exact') == (
+            'parameter density is read at the start: restart the node with -p density:=exact')
+        values = observer.call(GetParameters, 'get_parameters', names=['depth_max', 'density'])
+        assert values.values[0].double_value == 3.0
+        assert values.values[1].string_value == 'voxel'
         assert '* depth_max 4.0 m' in node.log
 
 

@@ -46,6 +46,9 @@ class Outputs:
     def clear(self, frame_id: str) -> None:
         self.cleared.append(frame_id)
 
+    def update(self, settings: Settings) -> None:
+        self.settings = settings
+
 
 class Log:
     """Keeps lines."""
@@ -299,6 +302,22 @@ def test_periodic_snapshots_of_what_is_new(make: Callable[..., Rig], tmp_path: P
     rig.worker.stop()
     assert rig.said('periodic snapshot') <= 2 * COUNT, 'none without new frames'
     assert rig.said('periodic snapshot: /') == len(list(tmp_path.glob('snapshots/*.ply')))
+
+
+def test_parameters_change_while_it_runs(make: Callable[..., Rig]) -> None:
+    """Depth limits hold for the next images; what the map cannot follow is said."""
+    rig = make(density='voxel', depth_max=5.0)
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
+    rig.outputs.changed.clear()
+    settings = Settings().updated({'depth_max': 0.5, 'depth_min': 0.2, 'publish_rate': 60.0})
+    rig.worker.update(settings)
+    rig.wait(lambda: rig.outputs.changed, 'the meshes to be sent again')
+    assert rig.outputs.settings == settings
+    rig.feed()
+    rig.wait(lambda: rig.worker.intake.cameras[''].dropped, 'depths beyond the new limit')
+    rig.worker.update(settings.updated({'depth_max': 8.0}))
+    rig.wait(lambda: rig.said('the map was begun with 5 m'), 'the warning')
 
 
 def test_a_snapshot_on_exit_where_asked(make: Callable[..., Rig], tmp_path: Path) -> None:

@@ -109,6 +109,12 @@ class Reconstruction:
             raise FrameError('empty_map', 'there is no map yet: no frame was integrated')
         return self._density
 
+    @property
+    def depth_max(self) -> float:
+        """Return up to which depth (m) the map takes pixels, whatever the settings became."""
+        lattice = self._density
+        return lattice.depth_max if isinstance(lattice, VoxelDensity) else float('inf')
+
     def add(self, view: View) -> Update:
         """
         Add a view's kernels to the density and march what they change.

@@ -83,6 +83,10 @@ class FrameAssembler:
         """Return the number of images that wait."""
         return len(self._images)
 
+    def update(self, settings: Settings) -> None:
+        """Take parameters that may change: depth_min and depth_max hold from the next image on."""
+        self._settings = settings
+
     def on_camera_info(self, msg: Any) -> None:
         """
         Take a camera_info; where it says something new it holds from its stamp on.

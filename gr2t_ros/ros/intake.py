@@ -105,6 +105,11 @@ class Intake:
         """Enqueue transforms."""
         self._enqueue(lambda: self.world.on_transforms(message, static))
 
+    def update(self, settings: Settings) -> None:
+        """Take parameters that may change; in the worker's thread."""
+        for camera in self.cameras.values():
+            camera.assembler.update(settings)
+
     def pause(self, paused: bool) -> None:
         """Ignore images from now on, or no longer."""
         with self._lock:

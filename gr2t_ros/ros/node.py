@@ -5,20 +5,23 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import fields
 import signal
 import sys
 import threading
 import time
 
+from rcl_interfaces.msg import SetParametersResult
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from ..core.reconstruction import warm_up
 from ..errors import InputError
-from .parameters import read_parameters, table
+from .parameters import changed, read_parameters, table, typed
 from .publishers import MapPublishers
 from .services import Services
 from .subscriptions import check_source, rectified, Subscriptions
@@ -47,6 +50,24 @@ class Gr2tNode(Node):
         self.inputs = Subscriptions(self, self.settings, self.worker.intake)
         self.offered = Services(self, self.worker, self._pause)
         self.worker.start()
+
+    def set_parameters_atomically(
+        self, parameter_list: Sequence[Parameter]
+    ) -> SetParametersResult:
+        """Change parameters of the running node; a refusal says why in our table's words."""
+        try:
+            settings = changed(self.settings, parameter_list)
+        except InputError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        result = super().set_parameters_atomically(typed(settings, parameter_list))
+        if result.successful and settings != self.settings:
+            for item in fields(settings):
+                new = getattr(settings, item.name)
+                if new != getattr(self.settings, item.name):
+                    self.get_logger().info(f'parameter {item.name} is now {new!r}')
+            self.settings = settings
+            self.worker.update(settings)
+        return result
 
     def _log_settings(self) -> None:
         self.get_logger().info(f'settings (* differs from the default):\n{table(self.settings)}')

@@ -3,12 +3,15 @@
 """The table of settings as a node's parameters."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import Field, fields
 from typing import Any
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
+from ..errors import InputError
 from ..settings import Settings
 
 # what rclpy declares or reads itself
@@ -35,6 +38,32 @@ def read_parameters(node: Node) -> Settings:
     return settings
 
 
+def changed(settings: Settings, parameters: Sequence[Parameter]) -> Settings:
+    """
+    Return the settings with what someone asks a running node to change.
+
+    :param parameters: those of ROS itself are passed over
+    :raises InputError: if a value cannot be used, or cannot change while the node runs
+    """
+    known = {item.name: item for item in fields(settings)}
+    values = {item.name: item.value for item in parameters if item.name in known}
+    new = settings.updated(values)
+    for name in values:
+        if not known[name].metadata['live'] and getattr(new, name) != getattr(settings, name):
+            raise InputError(
+                f'parameter {name} is read at the start: restart the node with -p '
+                f'{name}:={values[name]}')
+    return new
+
+
+def typed(settings: Settings, parameters: Sequence[Parameter]) -> list[Parameter]:
+    """Return parameters with the types that were declared: `3` is good enough for a float."""
+    names = {item.name for item in fields(settings) if item.metadata['live']}
+    return [
+        Parameter(item.name, value=getattr(settings, item.name)) if item.name in names else item
+        for item in parameters]
+
+
 def table(settings: Settings) -> str:
     """Return all values with their units as lines; a star marks those that were changed."""
     lines = []
@@ -49,7 +78,7 @@ def _descriptor(item: Field[Any]) -> ParameterDescriptor:
     meta = item.metadata
     unit = f' [{meta["unit"]}]' if meta['unit'] else ''
     descriptor = ParameterDescriptor(
-        name=item.name, description=meta['help'] + unit, read_only=True)
+        name=item.name, description=meta['help'] + unit, read_only=not meta['live'])
     if meta['choices']:
         descriptor.additional_constraints = f'one of {", ".join(meta["choices"])}'
     if meta['low'] is not None:

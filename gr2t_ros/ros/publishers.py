@@ -51,6 +51,10 @@ class MapPublishers:
         self._clouds: dict[int, NDArray[np.void]] = {}  # of each keyframe; see cloud
         self._scale = 0.0
 
+    def update(self, settings: Settings) -> None:
+        """Take parameters that may change."""
+        self._settings = settings
+
     def change(self, keyframes: Iterable[int]) -> None:
         """Note keyframes whose meshes changed."""
         self._waiting.update(dict.fromkeys(keyframes))

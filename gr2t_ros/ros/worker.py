@@ -49,6 +49,9 @@ class Outputs(Protocol):
     def clear(self, frame_id: str) -> None:
         """Take back all that was sent."""
 
+    def update(self, settings: Settings) -> None:
+        """Take parameters that may change."""
+
 
 class Worker:
     """
@@ -116,6 +119,24 @@ class Worker:
         self.intake.drop_images('reset')
         with self._wake:
             self._orders.appendleft(self._reset)
+            self._wake.notify()
+
+    def update(self, settings: Settings) -> None:
+        """Take parameters that changed, after the step at hand; all that is shown follows."""
+        def order() -> None:
+            self._settings = self._reconstruction.settings = settings
+            self.intake.update(settings)
+            self._outputs.update(settings)
+            self._outputs.change(range(len(self._reconstruction.keyframes)))
+            self._publish_at = 0.0
+            reach = self._reconstruction.depth_max
+            if settings.depth_max > reach:
+                self._log.warning(
+                    f'depth_max {settings.depth_max:g} m: the map was begun with {reach:g} m; '
+                    'what is deeper counts after ~/reset')
+
+        with self._wake:
+            self._orders.append(order)
             self._wake.notify()
 
     def snapshot(self) -> Future[Snapshot]:
