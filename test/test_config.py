@@ -96,6 +96,7 @@ def test_the_node_declares_every_parameter() -> None:
             described, meta = node.describe_parameter(item.name), item.metadata
             assert described.description.startswith(meta['help'])
             assert meta['unit'] in described.description
+            assert described.read_only == (not meta['live'])
             assert all(word in described.additional_constraints for word in meta['choices'])
             ranges = [*described.floating_point_range, *described.integer_range]
             assert [(span.from_value, span.to_value) for span in ranges] == (
