@@ -8,15 +8,17 @@ changing it, run scripts/write_parameters.py, which writes config/gr2t.yaml and 
 """
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, Field, field, fields, replace
 import difflib
 from math import isfinite
+import re
 from typing import Any
 
 from .errors import InputError
 
-Value = bool | int | float | str
+_NAME = re.compile(r'[A-Za-z_]\w*(/[A-Za-z_]\w*)*', re.ASCII)  # of a topic, relative
+Value = bool | int | float | str | tuple[str, ...]
 
 # The first parameter of each group, for config/gr2t.yaml and docs/parameters.md.
 GROUPS = {
@@ -109,6 +111,18 @@ class Settings:
     max_wait_for_pose: float = _parameter(
         1.0, 'An image that has no pose after this time is dropped, and counted.',
         unit='s', low=0.0, high=60.0)
+    time_offset: float = _parameter(
+        0.0, 'Added to the stamps of images before their pose is looked up: above 0 where images '
+        'are stamped earlier than the poses of the same moment.', unit='s', low=-60.0, high=60.0)
+    cameras: tuple[str, ...] = _parameter(
+        ('',), 'Names of cameras that build one map, such as [front, rear]: each has topics of '
+        'its own below its name. One without a name: the topics are the plain ones.')
+    depth_transport: str = _parameter(
+        'raw', 'How the depth images come: as depth/image, or compressed as '
+        'depth/image/compressedDepth.', choices=('raw', 'compressedDepth'))
+    input_qos: str = _parameter(
+        'auto', 'Reliability of the subscriptions to images, camera_info and poses; auto: '
+        'reliable where all publishers are.', choices=('auto', 'reliable', 'best_effort'))
     queue_size: int = _parameter(
         10, 'Images that may wait for the worker; when full the oldest is dropped, and counted.',
         low=1, high=1000)
@@ -136,6 +150,11 @@ class Settings:
             raise InputError(
                 f'parameter depth_min ({self.depth_min:g} m) must be below depth_max '
                 f'({self.depth_max:g} m)')
+
+        if not self.cameras or len(set(self.cameras)) < len(self.cameras) or (
+                self.cameras != ('',) and not all(map(_NAME.fullmatch, self.cameras))):
+            raise InputError(
+                f'parameter cameras must hold different names of topics, not {self.cameras!r}')
 
     def updated(self, values: Mapping[str, object]) -> Settings:
         """
@@ -172,6 +191,11 @@ def _parse(item: Field[Any], value: object) -> Value:
     text = isinstance(value, str)
     if kind is str and text:
         return str(value)
+    if kind is tuple:
+        if text:
+            value = [name.strip(' "\'') for name in str(value).strip('[] ').split(',')]
+        if isinstance(value, Sequence) and all(isinstance(name, str) for name in value):
+            return tuple(value) or default
     if kind is bool:
         if isinstance(value, bool):
             return value
@@ -186,7 +210,8 @@ def _parse(item: Field[Any], value: object) -> Value:
             return number
         if kind is int and isfinite(number) and number == int(number):
             return int(number)
-    names = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text'}
+    names = {bool: 'true or false', int: 'a whole number', float: 'a number', str: 'a text',
+             tuple: 'a list of texts, such as [front, rear]'}
     raise InputError(f'parameter {item.name} must be {names[kind]}, not {value!r}')
 
 

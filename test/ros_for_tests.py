@@ -3,7 +3,7 @@
 """The real node in its own process, and an observer of what it says over DDS."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 import os
 from pathlib import Path
@@ -83,17 +83,20 @@ class NodeProcess:
     :param isolation: its domain
     :param folder: of its log and its snapshots
     :param arguments: ROS arguments
+    :param ready: wait until it has subscribed
+    :param remap: other ROS arguments
     """
 
     def __init__(
-        self, isolation: Isolation, folder: Path, *arguments: str, ready: bool = True
+        self, isolation: Isolation, folder: Path, *arguments: str, ready: bool = True,
+        remap: Sequence[str] = REMAP,
     ) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         self.snapshots = folder / 'snapshots'
         self._path = folder / 'node.log'
         with open(self._path, 'w') as log:
             self._process = isolation.run(
-                'gr2t_ros.ros.node', '--ros-args', *REMAP, '-p',
+                'gr2t_ros.ros.node', '--ros-args', *remap, '-p',
                 f'snapshot_directory:={self.snapshots}', *arguments, stdout=log,
                 stderr=subprocess.STDOUT)
         if ready:

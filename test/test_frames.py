@@ -74,6 +74,14 @@ class TestPoseFromTf:
         np.testing.assert_allclose(view.depth, 1.5)
         assert frames.ready() == [] and not frames.dropped
 
+    def test_an_offset_above_0_is_for_images_that_are_stamped_early(self):
+        frames = assembler(time_offset=0.03)
+        move(frames, 0, 100 * MS)
+        frames.on_depth(depth(50 * MS))
+        view, = frames.ready()
+        np.testing.assert_allclose(view.T_world_camera, at(0.08), atol=1e-9)
+        assert view.stamp_ns == 80 * MS
+
     def test_views_come_in_the_order_of_the_images(self):
         frames = assembler()
         for i in range(5):

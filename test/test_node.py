@@ -264,17 +264,6 @@ def _messages(view: View) -> tuple[PoseStamped, CameraInfo, Image]:
     return pose, info, image
 
 
-def test_silence_is_reported_once(isolation: Isolation, tmp_path: Path) -> None:
-    """The warning names the resolved topics."""
-    with NodeProcess(isolation, tmp_path) as node:
-        log = node.wait_for('nothing came for 5 s')
-        warning = next(line for line in log.splitlines() if 'nothing came for' in line)
-        for topic in (DEPTH_TOPIC, CAMERA_INFO_TOPIC, '/tf'):
-            assert f'{topic} (0 publishers, 0 messages)' in warning
-        assert node.stop() == 0
-        assert node.log.count('nothing came for') == 1
-
-
 def test_images_without_poses_are_counted_and_explained(
     isolation: Isolation, tmp_path: Path
 ) -> None:

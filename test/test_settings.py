@@ -19,7 +19,22 @@ def test_values_may_be_texts_as_on_the_command_line():
     assert Settings().threads == 0
 
 
+@pytest.mark.parametrize('value', [
+    '[front, arm/rear]', ' ["front", \'arm/rear\']', 'front,arm/rear', ['front', 'arm/rear']])
+def test_lists_of_names(value):
+    assert Settings().updated({'cameras': value}).cameras == ('front', 'arm/rear')
+
+
+@pytest.mark.parametrize('value', ['[]', '', [], ['']])
+def test_no_name_is_one_camera_without_a_name(value):
+    assert Settings().updated({'cameras': value}).cameras == ('',)
+
+
 @pytest.mark.parametrize(('values', 'sentence'), [
+    ({'cameras': '[front, front]'}, 'cameras must hold different names of topics'),
+    ({'cameras': ['front', '']}, 'cameras must hold different names of topics'),
+    ({'cameras': '3d'}, 'cameras must hold different names of topics'),
+    ({'cameras': 3}, r'cameras must be a list of texts, such as \[front, rear\], not 3'),
     ({'thread': 2}, 'unknown parameter thread; did you mean threads?'),
     ({'xyzzy': 2}, 'unknown parameter xyzzy; known: pixel_bandwidth'),
     ({'depth_max': 'far'}, "depth_max must be a number, not 'far'"),

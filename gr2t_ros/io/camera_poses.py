@@ -83,7 +83,10 @@ class CameraPoses:
                 why = f'tf knows {known or "no frame yet"}; publish the camera\'s pose'
             raise NotYet('unconnected_frames', f'no pose of the camera frame {frame} at '
                          f'{seconds(stamp_ns)}: {why}')
-        T_world_camera = self._world.transform(world, frame, stamp_ns, ' or set world_frame')
+        root = tree.root(frame)
+        hint = ' or set world_frame' + (
+            f' to {root}, the root above {frame}' if root != frame else '')
+        T_world_camera = self._world.transform(world, frame, stamp_ns, hint)
         self._world.frame = world
         return T_world_camera
 

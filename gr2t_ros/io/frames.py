@@ -69,6 +69,7 @@ class FrameAssembler:
         self._rectified = rectified
         self._max_waiting = max_waiting
         self._max_wait_ns = int(settings.max_wait_for_pose * 1e9)
+        self._offset_ns = round(settings.time_offset * 1e9)
         self._now_ns = 0
         # of each frame the last two cameras, each with the stamp from which on it holds
         self._cameras: dict[str, list[tuple[int, Camera]]] = {}
@@ -186,10 +187,11 @@ class FrameAssembler:
 
     def _view(self, image: _Image) -> View:
         frame = image.frame or self._camera_frame
-        T_world_camera = self._poses.lookup(frame, image.stamp_ns)
+        stamp_ns = image.stamp_ns + self._offset_ns
+        T_world_camera = self._poses.lookup(frame, stamp_ns)
         camera = self._camera(frame, image)
         return View(
-            image.depth, camera, np.array(T_world_camera), image.stamp_ns, self._name)
+            image.depth, camera, np.array(T_world_camera), stamp_ns, self._name)
 
     def _camera(self, frame: str, image: _Image) -> Camera:
         frame = frame if frame in self._cameras else ''

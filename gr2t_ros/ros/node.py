@@ -46,7 +46,7 @@ class Gr2tNode(Node):
         self._compile()
         self.worker = Worker(
             self.settings, MapPublishers(self, self.settings), self.get_logger(),
-            rectified=rectified(self))
+            rectified=rectified(self, self.settings))
         self.inputs = Subscriptions(self, self.settings, self.worker.intake)
         self.offered = Services(self, self.worker, self._pause)
         self.worker.start()

@@ -12,7 +12,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ..errors import InputError
-from ..settings import Settings
+from ..settings import Settings, Value
 
 # what rclpy declares or reads itself
 _OF_ROS = ('use_sim_time', 'start_type_description_service', 'qos_overrides')
@@ -33,8 +33,8 @@ def read_parameters(node: Node) -> Settings:
     for name in given:
         node.undeclare_parameter(name)
     for item in fields(settings):
-        node.declare_parameter(
-            item.name, getattr(settings, item.name), _descriptor(item), ignore_override=True)
+        value = _value(getattr(settings, item.name))
+        node.declare_parameter(item.name, value, _descriptor(item), ignore_override=True)
     return settings
 
 
@@ -62,6 +62,11 @@ def typed(settings: Settings, parameters: Sequence[Parameter]) -> list[Parameter
     return [
         Parameter(item.name, value=getattr(settings, item.name)) if item.name in names else item
         for item in parameters]
+
+
+def _value(value: Value) -> bool | int | float | str | list[str]:
+    """Return a value as rclpy takes it."""
+    return list(value) if isinstance(value, tuple) else value
 
 
 def table(settings: Settings) -> str:

@@ -9,11 +9,11 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformS
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..errors import InputError
 from ..settings import Settings
-from .inputs import Input, missing, transforms_profile
+from .inputs import Input, silence, transforms_profile
 from .intake import Intake
 
 try:
@@ -24,7 +24,7 @@ except ImportError:
 _POSES = {
     'pose': PoseStamped, 'pose_with_covariance': PoseWithCovarianceStamped,
     'odometry': Odometry, 'transform': TransformStamped}
-_FOLLOW_PERIOD = 0.2  # s between looks at the publishers' reliability
+_FOLLOW_PERIOD = 0.2  # s between looks at the publishers' QoS
 _SILENCE = 5.0  # s without input that are worth a warning
 _SMALL = 100  # camera_info and poses that may wait for the executor
 
@@ -41,9 +41,17 @@ def check_source(settings: Settings) -> None:
             'take the poses from a topic (pose_source:=pose)')
 
 
-def rectified(node: Node) -> dict[str, bool]:
+def rectified(node: Node, settings: Settings) -> dict[str, bool]:
     """Return for each camera whether its depth images are, as their topic's name says."""
-    return {'': 'rect' in node.resolve_topic_name('depth/image').rpartition('/')[2]}
+    return {
+        camera: 'rect' in node.resolve_topic_name(
+            relative(camera, 'depth/image')).rpartition('/')[2]
+        for camera in settings.cameras}
+
+
+def relative(camera: str, topic: str) -> str:
+    """Return the name of a camera's topic."""
+    return f'{camera}/{topic}' if camera else topic
 
 
 class Subscriptions:
@@ -60,41 +68,59 @@ class Subscriptions:
         self._intake = intake
         self._warned = False
         self.paused = False
-        transforms = [
+        self._transforms = [
             Input(
                 node, TFMessage, topic, partial(intake.on_transforms, static=static), _SMALL,
-                transforms_profile(static=static))
+                once=True, profile=transforms_profile(static=static))
             for topic, static in (('/tf_static', True), ('/tf', False)) if TFMessage is not None]
-        self._poses = transforms
-        if settings.pose_source != 'tf':
-            self._poses = [
-                Input(node, _POSES[settings.pose_source], 'pose', intake.on_pose, _SMALL)]
-        # the images' comes last
-        self._inputs = [
-            Input(node, CameraInfo, 'depth/camera_info', intake.on_camera_info, _SMALL),
-            Input(node, Image, 'depth/image', intake.on_depth, settings.queue_size)]
+        self._needed = [
+            item for camera in settings.cameras for item in self._of_camera(camera, settings)]
+        self._tf_is_needed = settings.pose_source == 'tf'
         node.get_logger().info('subscribed to ' + ', '.join(item.topic for item in self.inputs))
         # these go on where simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_FOLLOW_PERIOD, self._follow_publishers, clock=steady)
         node.create_timer(1.0, self._check_inputs, clock=steady)
 
+    def _of_camera(self, camera: str, settings: Settings) -> list[Input]:
+        """Return a camera's inputs; the images' comes last."""
+        node, intake = self._node, self._intake
+        inputs = []
+        if settings.pose_source != 'tf':
+            inputs.append(Input(
+                node, _POSES[settings.pose_source], relative(camera, 'pose'),
+                partial(intake.on_pose, camera=camera), _SMALL, reliability=settings.input_qos))
+        inputs.append(Input(
+            node, CameraInfo, relative(camera, 'depth/camera_info'),
+            partial(intake.on_camera_info, camera=camera), _SMALL, once=True,
+            reliability=settings.input_qos))
+        kind, topic = Image, relative(camera, 'depth/image')
+        if settings.depth_transport != 'raw':  # as image_transport: by the name that was remapped
+            kind = CompressedImage
+            topic = f'{node.resolve_topic_name(topic)}/{settings.depth_transport}'
+        inputs.append(Input(
+            node, kind, topic, partial(intake.on_depth, camera=camera), settings.queue_size,
+            reliability=settings.input_qos))
+        return inputs
+
     @property
     def inputs(self) -> list[Input]:
         """Return all of them."""
-        return [*self._poses, *self._inputs]
+        return [*self._transforms, *self._needed]
 
     def _follow_publishers(self) -> None:
         for item in self.inputs:
             if item.follow():
                 self._node.get_logger().info(
-                    f'{item.topic}: {"reliable" if item.reliable else "best effort"}, as its '
-                    'publishers are')
+                    f'{item.topic}: {item.requested}, as its publishers are')
+            if mismatch := item.mismatch():
+                self._node.get_logger().warning(mismatch)
 
     def _check_inputs(self) -> None:
         """Warn once when something is missing, and again only after it had come."""
-        sentence = '' if self.paused else missing(self._inputs, self._poses, _SILENCE)
-        if sentence and not self._warned:
-            self._node.get_logger().warning(
-                f'{sentence}; remap the node\'s topics (depth/image:=...) or start the publishers')
-        self._warned = bool(sentence)
+        lines = '' if self.paused else silence(
+            self._needed, self._transforms if self._tf_is_needed else (), _SILENCE,
+            self._intake.world.frames())
+        if lines and not self._warned:
+            self._node.get_logger().warning(lines)
+        self._warned = bool(lines)

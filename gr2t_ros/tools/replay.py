@@ -31,7 +31,8 @@ from .results import write_results
 
 _MAX_WAITING = 100  # images, while the recording has not come to their poses yet
 # parameters of no effect here
-_LIVE = ('max_wait_for_pose', 'queue_size', 'publish_rate', 'display_stride',
+_LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'queue_size',
+         'publish_rate', 'display_stride',
          'snapshot_directory', 'snapshot_on_exit')
 
 
