@@ -116,7 +116,8 @@ class Input:
             return ''
         deaf = {
             f'{node_name(info)} offers {qos_text(info.qos_profile)}' for info in self.publishers
-            if not _compatible(info.qos_profile, self._profile)} - self._complained
+            if 'UNKNOWN' not in info.node_name  # it is known a moment later
+            and not _compatible(info.qos_profile, self._profile)} - self._complained
         if not deaf:
             return ''
         self._complained |= deaf
