@@ -14,7 +14,7 @@ from numba import int64, njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
-from .vector import ROW
+from .vector import copy_eight, five_taps, ROW
 
 Floats = NDArray[np.float32]
 
@@ -153,7 +153,7 @@ def _rehash(
         table_block[slot] = block
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _insert(
     blocks: Blocks, size: int, keys: NDArray[np.int64], done: int, change: int,
     found: NDArray[np.int32], count: int,
@@ -177,7 +177,7 @@ def _insert(
     return size, count, len(keys)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _link(blocks: Blocks, block: int) -> None:
     """Enter a new block in its neighbours' lists, and them in its own."""
     x, y, z = place_of(blocks.key[block])
@@ -206,54 +206,57 @@ def with_neighbours(
     return out[:count].copy()
 
 
-@njit(cache=True, nogil=True, fastmath={'contract', 'nsz', 'reassoc'})
+@njit(cache=True, nogil=True)
 def prefilter(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
     """Compute the chosen blocks' own coefficients from the values in and about them."""
-    wide = np.zeros((12, 12, 12), np.float32)
-    along_x = np.zeros((12, 12, 8), np.float32)
-    along_y = np.zeros((12, 8, 8), np.float32)
+    # rows of 16, of which 12 are used
+    _prefilter(
+        blocks, chosen, np.zeros(144 * 16, np.float32), np.zeros(144 * SIDE, np.float32),
+        np.zeros(12 * SIDE * SIDE, np.float32))
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _prefilter(
+    blocks: Blocks, chosen: NDArray[np.int32], wide: Floats, along_x: Floats, along_y: Floats
+) -> None:
+    """
+    Filter along x, then y, then z.
+
+    :param wide: the block's values and two more on each side; with along_x and along_y scratch
+    """
+    value, coefficient, neighbour = blocks.value, blocks.coefficient, blocks.neighbour
     for block in chosen:
-        for z in range(12):
-            nz = (z + 6) // 8
-            for y in range(12):
-                ny = (y + 6) // 8
-                line = ((z + 6) % 8 * 8 + (y + 6) % 8) * 8
+        for nz in range(3):
+            z_first, z_end = 8 * nz - 6, min(8 * nz + 2, 12)
+            for ny in range(3):
+                y_first, y_end = 8 * ny - 6, min(8 * ny + 2, 12)
                 n = 9 * nz + 3 * ny
-                left = int64(blocks.neighbour[block, n]) * VOXELS + line
-                middle = int64(blocks.neighbour[block, n + 1]) * VOXELS + line
-                right = int64(blocks.neighbour[block, n + 2]) * VOXELS + line
-                wide[z, y, 0] = blocks.value[left + 6]
-                wide[z, y, 1] = blocks.value[left + 7]
-                for x in range(8):
-                    wide[z, y, x + 2] = blocks.value[middle + x]
-                wide[z, y, 10] = blocks.value[right]
-                wide[z, y, 11] = blocks.value[right + 1]
+                left = int64(neighbour[block, n]) * VOXELS
+                middle = int64(neighbour[block, n + 1]) * VOXELS
+                right = int64(neighbour[block, n + 2]) * VOXELS
+                for z in range(max(z_first, 0), z_end):
+                    for y in range(max(y_first, 0), y_end):
+                        line = ((z - z_first) * SIDE + y - y_first) * SIDE
+                        to = (12 * z + y) * 16
+                        wide[to] = value[left + line + 6]
+                        wide[to + 1] = value[left + line + 7]
+                        copy_eight(value, middle + line, wide, to + 2)
+                        wide[to + 10] = value[right + line]
+                        wide[to + 11] = value[right + line + 1]
+        for row in range(144):
+            five_taps(wide, 16 * row, 1, _TAP0, _TAP1, _TAP2, along_x, SIDE * row)
         for z in range(12):
-            for y in range(12):
-                for x in range(8):
-                    along_x[z, y, x] = (
-                        _TAP0 * wide[z, y, x + 2]
-                        + _TAP1 * (wide[z, y, x + 1] + wide[z, y, x + 3])
-                        + _TAP2 * (wide[z, y, x] + wide[z, y, x + 4]))
-        for z in range(12):
-            for y in range(8):
-                for x in range(8):
-                    along_y[z, y, x] = (
-                        _TAP0 * along_x[z, y + 2, x]
-                        + _TAP1 * (along_x[z, y + 1, x] + along_x[z, y + 3, x])
-                        + _TAP2 * (along_x[z, y, x] + along_x[z, y + 4, x]))
-        first = int64(block) * COEFFICIENTS
-        for z in range(8):
-            for y in range(8):
-                line = first + (z * 8 + y) * ROW
-                for x in range(8):
-                    blocks.coefficient[line + x] = (
-                        _TAP0 * along_y[z + 2, y, x]
-                        + _TAP1 * (along_y[z + 1, y, x] + along_y[z + 3, y, x])
-                        + _TAP2 * (along_y[z, y, x] + along_y[z + 4, y, x]))
+            for y in range(SIDE):
+                five_taps(
+                    along_x, 96 * z + SIDE * y, SIDE, _TAP0, _TAP1, _TAP2,
+                    along_y, 64 * z + SIDE * y)
+        for row in range(64):
+            five_taps(
+                along_y, SIDE * row, 64, _TAP0, _TAP1, _TAP2,
+                coefficient, int64(block) * COEFFICIENTS + ROW * row)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def copy_margins(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
     """Copy the first coefficients of the chosen blocks' rows behind the rows before them."""
     for block in chosen:

@@ -134,6 +134,11 @@ class Camera:
         return rays
 
     @cached_property
+    def has_blind_pixels(self) -> bool:
+        """Return whether some pixels have no ray."""
+        return bool(np.isnan(self.rays).any())
+
+    @cached_property
     def parameters(self) -> NDArray[np.float64]:
         """Return what the kernels' project_jet needs, (14,) float64."""
         reach = np.inf

@@ -9,9 +9,9 @@ elsewhere the ray takes the mean-shift step, which always climbs. It stays withi
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any
 
-from numba import njit
+from numba import from_dtype, njit
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,7 +19,8 @@ Doubles = NDArray[np.float64]
 
 INTERVAL = 4.0  # h3; the search goes this far from the start
 MAX_ITERATIONS = 50
-_TOLERANCE = 0.02  # h3; a Newton step this short is the last, and good to its cube
+_TOLERANCE = 0.05  # h3; a Newton step this short is the last, and good to its cube
+_KINK = 0.02  # h3
 
 
 class Status(IntEnum):
@@ -32,67 +33,74 @@ class Status(IntEnum):
     ITERATION_LIMIT = 4
 
 
-class Climber(NamedTuple):
+# A ray on its way, lengths in metres of depth.
+#   start, h3    where it set out, and the bandwidth there
+#   target       where it wants to know the density next
+#   beta         the best place so far, with the density's value and derivatives there, and the g
+#                that makes first / g the mean-shift step
+#   careful      whether the target is the cautious one
+#   stretch      mean-shift steps in a row grow by this: between two humps they are tiny
+#   status       a Status; NOT_MARCHED while it goes on
+#   evaluations  of the density so far
+CLIMBER = from_dtype(np.dtype([
+    ('start', 'f8'), ('h3', 'f8'), ('target', 'f8'), ('beta', 'f8'), ('value', 'f8'),
+    ('first', 'f8'), ('second', 'f8'), ('g', 'f8'), ('stretch', 'f8'), ('careful', 'i8'),
+    ('status', 'i8'), ('evaluations', 'i8')]))
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def set_out(ray: Any, start: float, h3: float) -> None:
+    """Put a ray at its start."""
+    ray.start, ray.h3 = start, h3
+    ray.target, ray.beta = start, start
+    ray.value, ray.first, ray.second, ray.g = 0.0, 0.0, 0.0, 1.0
+    ray.stretch = 0.5
+    ray.careful, ray.status, ray.evaluations = 0, 0, 0
+
+
+@njit(cache=True, nogil=True, error_model='numpy', _nrt=False)
+def climb(ray: Any, value: float, first: float, second: float, g: float) -> None:
     """
-    A ray on its way, all in units of its depth.
+    Take in the density at the ray's target and choose the next, or end.
 
-    :param status: a Status; NOT_MARCHED while it goes on
-    :param target: where it wants to know the density next
-    :param beta: the best place so far, with the density's value, derivatives, and the g that makes
-        first / g the mean-shift step
-    :param careful: whether the target is the cautious one
-    :param stretch: mean-shift steps in a row grow by this: between two humps they are tiny
-    """
-
-    status: int
-    target: float
-    beta: float
-    value: float
-    first: float
-    second: float
-    g: float
-    careful: bool
-    stretch: float
-
-
-@njit(cache=True, nogil=True)
-def set_out(start: float) -> Climber:
-    """Return a ray at its start."""
-    return Climber(0, start, start, 0.0, 0.0, 0.0, 1.0, False, 0.5)
-
-
-@njit(cache=True, nogil=True, error_model='numpy')
-def climb(
-    ray: Climber, start: float, h3: float, value: float, first: float, second: float, g: float
-) -> Climber:
-    """
-    Take in the density at the ray's target and choose the next.
-
-    :param start: where the ray set out, and h3 the bandwidth there
+    :param ray: a CLIMBER
     :param value: f at the target, with f', f'' and the mean-shift's g
     """
-    low, high = start - INTERVAL * h3, start + INTERVAL * h3
-    if value < ray.value and not ray.careful:
+    h3 = ray.h3
+    low, high = ray.start - INTERVAL * h3, ray.start + INTERVAL * h3
+    ray.evaluations += 1
+    status = 0 if ray.evaluations < MAX_ITERATIONS else 4
+    if value < ray.value and ray.careful == 0:
         # too far: the plain mean-shift step climbs
         step = min(max(ray.first / ray.g, -h3), h3)
-        return Climber(
-            0, min(max(ray.beta + step, low), high), ray.beta, ray.value, ray.first, ray.second,
-            ray.g, True, 0.5)
+        ray.target = min(max(ray.beta + step, low), high)
+        ray.careful, ray.stretch, ray.status = 1, 0.5, status
+        return
     beta = ray.target
+    # where f' changes sign within the tolerance the maximum is in between: f' may jump there, and
+    # then no step gets shorter
+    between = (
+        ray.value > 0 and ray.first * first < 0 and abs(beta - ray.beta) <= _KINK * h3)
+    stretch = ray.stretch
+    ray.beta, ray.value, ray.first, ray.second, ray.g = beta, value, first, second, g
+    ray.careful, ray.stretch = 0, 0.5
     if value <= 0:
-        return Climber(3, beta, beta, value, first, second, g, False, 0.5)
-    if ray.value > 0 and ray.first * first < 0 and abs(beta - ray.beta) <= _TOLERANCE * h3:
-        # the maximum is in between: f' may jump there, and then no step gets shorter
-        return Climber(1, beta, beta, value, first, second, g, False, 0.5)
+        ray.status = 3
+        return
+    if between:
+        ray.status = 1
+        return
     newton = second < 0
-    stretch = 0.5 if newton else 2.0 * ray.stretch
-    step = -first / second if newton else stretch * first / g
-    if newton and abs(step) <= _TOLERANCE * h3 and low <= beta + step <= high:
-        return Climber(
-            1, beta, beta + step, value + 0.5 * first * step, first, second, g, False, 0.5)
-    target = min(max(beta + min(max(step, -h3), h3), low), high)
-    status = 2 if target == beta else 0
-    return Climber(status, target, beta, value, first, second, g, False, stretch)
+    if newton:
+        step = -first / second
+        if abs(step) <= _TOLERANCE * h3 and low <= beta + step <= high:
+            ray.beta, ray.value, ray.status = beta + step, value + 0.5 * first * step, 1
+            return
+    else:
+        ray.stretch = 2.0 * stretch
+        step = ray.stretch * first / g
+    ray.target = min(max(beta + min(max(step, -h3), h3), low), high)
+    ray.status = 2 if ray.target == beta else status
 
 
 @njit(cache=True, nogil=True)

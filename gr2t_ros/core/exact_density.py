@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import project_jet
-from .climb import aim, climb, h3_at, INTERVAL, MAX_ITERATIONS, set_out, Status
+from .climb import aim, climb, CLIMBER, h3_at, INTERVAL, set_out
 from .kernel import (
     axis_weights,
     Floats,
@@ -434,28 +434,29 @@ def _jets(
 def march_rays(
     state: ViewSum, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
     pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,
-    depths: Floats, totals: Floats, statuses: NDArray[np.uint8], counts: NDArray[np.uint8],
+    depths: Floats, totals: Floats, curvatures: Floats, statuses: NDArray[np.uint8],
+    counts: NDArray[np.uint8],
 ) -> None:
     """Climb from the starts of chosen rays; see ray_march.Rays for the arrays."""
     scratch = new_scratch(state)
     origin = T_world_camera[:3, 3].copy()
     direction = np.zeros(3)
+    ray = np.zeros(1, CLIMBER)[0]
     for i in chosen:
         aim(table, T_world_camera, pixels[i], direction)
         start = np.float64(starts[i])
         h3 = h3_at(bandwidth, start)
         reach = INTERVAL * h3
         _prepare(state, scratch, origin, direction, start - reach, start + reach)
-        ray = set_out(start)
-        count = 0
-        while ray.status == 0 and count < MAX_ITERATIONS:
+        set_out(ray, start, h3)
+        while ray.status == 0:
             f, f1, f2, g = jet_along(state, scratch, origin, direction, ray.target, h3)
-            ray = climb(ray, start, h3, f, f1, f2, g)
-            count += 1
+            climb(ray, f, f1, f2, g)
         depths[i] = ray.beta
         totals[i] = ray.value
-        statuses[i] = ray.status if ray.status != 0 else Status.ITERATION_LIMIT
-        counts[i] = count
+        curvatures[i] = ray.second
+        statuses[i] = ray.status
+        counts[i] = ray.evaluations
 
 
 @njit(cache=True, nogil=True)

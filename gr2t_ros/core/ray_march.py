@@ -13,6 +13,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from types import ModuleType
 
+from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,7 +23,7 @@ from .exact_density import ExactDensity
 from .view import View
 from .voxel_density import VoxelDensity
 from .voxel_query import keys_along
-from .warped import robust_starts, Scale, warped, Weights
+from .warped import robust_starts, Scale, Warped, warped, Weights
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -42,6 +43,8 @@ class Rays:
     :param start: (n,) float32, metres
     :param depth: (n,) float32, metres: the maximum where converged
     :param total: (n,) float32: C times the likelihood there
+    :param curvature: (n,) float32: its second derivative along the depth, 1/m^2, where it was
+        evaluated last
     :param status: (n,) uint8, Status
     :param iterations: (n,) uint8: evaluations of the density
     :param marched: (n,) int32: the density's change up to which the ray is right
@@ -53,6 +56,7 @@ class Rays:
     start: Floats
     depth: Floats
     total: Floats
+    curvature: Floats
     status: NDArray[np.uint8]
     iterations: NDArray[np.uint8]
     marched: NDArray[np.int32]
@@ -95,23 +99,42 @@ def rays_of(
     :param start: robust or observed
     """
     camera = view.camera
-    valid = np.isfinite(view.depth) & np.isfinite(camera.rays[..., 0])
-    grid = np.zeros_like(valid)
-    grid[::stride, ::stride] = True
-    pixels = np.flatnonzero(valid & grid).astype(np.int32)
+    depth = np.ascontiguousarray(view.depth, np.float32)
+    pixels = _valid_pixels(depth, camera.rays, stride)
     n = len(pixels)
-    depth = np.ascontiguousarray(view.depth, np.float32).ravel()
+    depth = depth.ravel()
     starts = depth[pixels]
     if start == 'robust' and n:
-        weights = Weights.of(density.pixel_bandwidth)
-        image = warped(view, Scale.of(*density.bandwidth, float(starts.max())), weights)
+        image, weights = _own_image(density, view, float(starts.max()))
         _over_chunks(
             pool, n, lambda part: robust_starts(
                 image, weights, camera.width, depth, pixels[part], starts[part]))
     return Rays(
         pixels, camera.rays, np.array(view.T_world_camera, np.float64), starts, starts.copy(),
-        np.zeros(n, np.float32), np.zeros(n, np.uint8), np.zeros(n, np.uint8),
+        np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.uint8),
+        np.zeros(n, np.uint8),
         np.full(n, -1, np.int32))
+
+
+@njit(cache=True, nogil=True)
+def _valid_pixels(depth: Floats, table: Doubles, stride: int) -> NDArray[np.int32]:
+    """Return the flat indices of the pixels that have a depth and a ray."""
+    height, width = depth.shape
+    pixels = np.zeros(-(-height // stride) * -(-width // stride), np.int32)
+    count = 0
+    for v in range(0, height, stride):
+        for u in range(0, width, stride):
+            pixels[count] = v * width + u
+            count += np.isfinite(depth[v, u]) and np.isfinite(table[v, u, 0])
+    return pixels[:count].copy()
+
+
+def _own_image(density: Density, view: View, deepest: float) -> tuple[Warped, Weights]:
+    """Return a view's depth image in units of its bandwidth, and the lateral kernel."""
+    if isinstance(density, VoxelDensity):
+        return density.image_of(view), density.weights
+    weights = Weights.of(density.pixel_bandwidth)
+    return warped(view, Scale.of(*density.bandwidth, deepest), weights), weights
 
 
 def march(
@@ -127,8 +150,8 @@ def march(
     _over_chunks(
         pool, len(which), lambda part: kernels.march_rays(
             density.state, density.bandwidth, which[part], rays.pixels, rays.table,
-            rays.T_world_camera, rays.start, rays.depth, rays.total, rays.status,
-            rays.iterations))
+            rays.T_world_camera, rays.start, rays.depth, rays.total, rays.curvature,
+            rays.status, rays.iterations))
     rays.marched[which] = density.change
 
 

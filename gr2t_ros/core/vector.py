@@ -60,6 +60,11 @@ class _Vectors:
         vector.align = 4
         return vector
 
+    def store(self, vector: Any, pointer: Any, index: Any) -> None:
+        place = self.builder.gep(pointer, [index])
+        self.builder.store(
+            vector, self.builder.bitcast(place, self.type.as_pointer()), align=4)
+
     def splat_of(self, pointer: Any, index: Any) -> Any:
         return self.splat(self.builder.load(self.builder.gep(pointer, [index])))
 
@@ -68,6 +73,9 @@ class _Vectors:
 
     def minimum(self, a: Any, b: Any) -> Any:
         return self._call('llvm.minnum', a, b)
+
+    def maximum(self, a: Any, b: Any) -> Any:
+        return self._call('llvm.maxnum', a, b)
 
     def total(self, vector: Any) -> Any:
         function = _declared(
@@ -146,6 +154,90 @@ def _window_strip(  # type: ignore[no-untyped-def]
         builder.cbranch(builder.icmp_signed('<', new_done, count), loop, after)
         builder.position_at_end(after)
         return v.total(builder.fmul(builder.fadd(new_even, new_odd), v.load(columns, column)))
+
+    return signature, generate
+
+
+@intrinsic
+def _agreement(  # type: ignore[no-untyped-def]
+    typing_context, image, first, stride, weights, middle, out
+):
+    """
+    Bound from below what the 24 pixels about each of eight neighbours add up to at its depth.
+
+    out[a] = sum weights[middle + r] weights[middle + c] max(1 - 16 x^2, 0), r and c from -2 to 2
+    but not both 0, x = image[first + a + r stride + c] - image[first + a], a < 8: exp(-16 x^2) is
+    not less. Arrays are flat float32.
+    """
+    signature = types.void(image, types.int64, types.int64, weights, types.int64, out)
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        pointer = _pointers(context, builder, signature, arguments)
+        first, stride, middle = arguments[1], arguments[2], arguments[4]
+        v = _Vectors(builder, LANES)
+        centre = v.load(pointer(0), first)
+        weights = [
+            v.splat_of(pointer(3), builder.add(middle, ir.Constant(_I64, c)))
+            for c in range(-2, 3)]
+        total = v.constant(0)
+        for r in range(-2, 3):
+            start = builder.add(first, builder.mul(stride, ir.Constant(_I64, r)))
+            row = v.constant(0)
+            for c in range(-2, 3):
+                if r == 0 and c == 0:
+                    continue
+                pixels = v.load(pointer(0), builder.add(start, ir.Constant(_I64, c)))
+                x = builder.fsub(pixels, centre)
+                kernel = v.multiply_add(builder.fmul(x, x), v.constant(-16), v.constant(1))
+                row = v.multiply_add(
+                    weights[c + 2], v.maximum(kernel, v.constant(0)), row)
+            total = v.multiply_add(weights[r + 2], row, total)
+        v.store(total, pointer(5), ir.Constant(_I64, 0))
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def _five_taps(  # type: ignore[no-untyped-def]
+    typing_context, source, first, step, tap0, tap1, tap2, out, to
+):
+    """
+    Filter eight values: out[to + a] = tap0 s[2] + tap1 (s[1] + s[3]) + tap2 (s[0] + s[4]), a < 8.
+
+    s[k] = source[first + a + k step]. Arrays are flat float32, and do not overlap.
+    """
+    signature = types.void(
+        source, types.int64, types.int64, types.float32, types.float32, types.float32, out,
+        types.int64)
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        pointer = _pointers(context, builder, signature, arguments)
+        v = _Vectors(builder, LANES)
+        first, step = arguments[1], arguments[2]
+        tap0, tap1, tap2 = (v.splat(tap) for tap in arguments[3:6])
+        s = []
+        for _ in range(5):
+            s.append(v.load(pointer(0), first))
+            first = builder.add(first, step)
+        total = builder.fmul(tap2, builder.fadd(s[0], s[4]))
+        total = v.multiply_add(tap1, builder.fadd(s[1], s[3]), total)
+        v.store(v.multiply_add(tap0, s[2], total), pointer(6), arguments[7])
+        return context.get_dummy_value()
+
+    return signature, generate
+
+
+@intrinsic
+def _copy_eight(typing_context, source, first, out, to):  # type: ignore[no-untyped-def]
+    """Copy source[first + a] to out[to + a], a < 8. Arrays are flat float32."""
+    signature = types.void(source, types.int64, out, types.int64)
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        pointer = _pointers(context, builder, signature, arguments)
+        v = _Vectors(builder, LANES)
+        v.store(v.load(pointer(0), arguments[1]), pointer(2), arguments[3])
+        return context.get_dummy_value()
 
     return signature, generate
 
@@ -242,4 +334,7 @@ def _spline_jet(  # type: ignore[no-untyped-def]
 
 # for type checkers: callers do not pass the first argument
 window_strip: Callable[..., np.float32] = _window_strip
+agreement: Callable[..., None] = _agreement
+five_taps: Callable[..., None] = _five_taps
+copy_eight: Callable[..., None] = _copy_eight
 spline_jet: Callable[..., tuple[np.float32, np.float32, np.float32]] = _spline_jet

@@ -24,10 +24,10 @@ from .view import View
 from .voxel_add import add_to_blocks, keys_of_view, Place
 from .voxel_query import jets, Lattice
 from .warped import (
-    depth_ranges,
     empty_support,
     find_support,
     Scale,
+    Warped,
     warped,
     Weights,
 )
@@ -75,6 +75,7 @@ class VoxelDensity:
         self.aliased_pixels = 0  # nearer than the lattice can follow
         self._depth_of_bins = self.scale.depth_of_bins()
         self._change = 0
+        self._recent: tuple[View, Warped] | None = None  # a keyframe's rays need its image again
         self._stale: list[NDArray[np.int32]] = []
 
     @property
@@ -181,6 +182,12 @@ class VoxelDensity:
         found /= max(self.size, 1)
         return found[:, 0], found[:, 1], found[:, 2]
 
+    def image_of(self, view: View) -> Warped:
+        """Return a view's depth image in units of its bandwidth."""
+        if self._recent is None or self._recent[0] is not view:
+            self._recent = (view, warped(view, self.scale, self.weights))
+        return self._recent[1]
+
     def _check_reach(self, view: View) -> None:
         """Refuse a camera from where a block's number could not be written down."""
         reach = 2.0 ** 20 * SIDE * self.voxel_size
@@ -202,19 +209,18 @@ class VoxelDensity:
         place = Place(
             R_camera_world, -R_camera_world @ T[:3, 3], view.camera.parameters, width, height,
             factor)
-        image = warped(view, self.scale, self.weights)
+        image = self.image_of(view)
         support = empty_support(height, width)
         rows = [
-            (i, min(i + _ROWS_OF_CELLS, len(support.mask)))
-            for i in range(0, len(support.mask), _ROWS_OF_CELLS)]
-        ranges = depth_ranges(image.bins)
+            (i, min(i + _ROWS_OF_CELLS, len(image.low)))
+            for i in range(0, len(image.low), _ROWS_OF_CELLS)]
         _all(pool, find_support, [
-            (image.bins, *ranges, self.weights.lanes, support, *part) for part in rows])
+            (image, height, width, self.weights.lanes, support, *part) for part in rows])
         keys = _all(pool, keys_of_view, [
             (support, view.camera.rays, R_world_camera, T[:3, 3].copy(), self._depth_of_bins,
              SIDE * self.voxel_size, self.weights.lanes // 2, *part) for part in rows])
         self.size += sign
-        self.pixels += sign * int(np.count_nonzero(np.isfinite(view.depth)))
+        self.pixels += sign * image.valid
         nearest = self.voxel_size / self.finest_voxel(1.0, view.camera)
         self.aliased_pixels += sign * int(np.count_nonzero(view.depth < nearest))
         self._change += 1

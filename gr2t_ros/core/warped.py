@@ -17,7 +17,7 @@ from numba import njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
-from .vector import LANES, window_strip
+from .vector import agreement, LANES, window_strip
 from .view import View
 
 Floats = NDArray[np.float32]
@@ -30,9 +30,11 @@ _SAMPLES = 8192  # of t(z), which goes on some way beyond depth_max
 _BEYOND = 1.1
 CELL = 4  # px; side of the squares that know their support
 SUPPORT = 3.0  # bandwidths along the depth at which a kernel ends
+CELL_BITS = 2  # of CELL
 BINS = 2.0  # a bandwidth; resolution of the support
 _UNWARP = np.float32(BINS * _SQRT32)
 _OUTLIER = np.float32(0.2)  # less than this share of the window's best density makes an outlier
+_CERTAIN = _OUTLIER + np.float32(0.001)  # more than the kernels' rounding
 _NEIGHBOURS = 2  # px; candidates for the robust start come from 5 x 5 pixels
 
 
@@ -111,25 +113,33 @@ class Warped(NamedTuple):
     :param image: flat padded image of t / sqrt(32), INVALID where there is none
     :param stride: of its rows
     :param pad: pixels before the first, on both axes
-    :param bins: (h, w) int32, the support bin of each pixel, -1 where invalid
+    :param low: (rows, columns) int32, the least support bin in each cell of CELL x CELL pixels,
+        2^30 where there is none; high: the largest, -1
+    :param valid: pixels that have a depth
     """
 
     image: Floats
     stride: int
     pad: int
-    bins: NDArray[np.int32]
+    low: NDArray[np.int32]
+    high: NDArray[np.int32]
+    valid: int
 
 
 class Support(NamedTuple):
     """
-    Where a view's kernels are, by cells of CELL x CELL pixels.
+    Where a view's kernels are, by cells of CELL x CELL pixels, row by row.
 
-    Bit k of a cell says that pixels about it have kernels in the bins base + (k << shift) on.
+    Bit k of a cell says that pixels about it have kernels in the bins base + (k << shift) on. One
+    more cell, the last, is empty.
+
+    :param columns: cells in a row
     """
 
     base: NDArray[np.int32]
     shift: NDArray[np.int32]
     mask: NDArray[np.uint64]
+    columns: int
 
 
 def warped(view: View, scale: Scale, weights: Weights) -> Warped:
@@ -137,72 +147,60 @@ def warped(view: View, scale: Scale, weights: Weights) -> Warped:
     height, width = view.depth.shape
     pad = 2 * weights.lanes + CELL
     image = np.full((height + 2 * pad, width + 2 * pad), INVALID)
-    bins = np.full((height, width), -1, np.int32)
+    shape = (-(-height // CELL), -(-width // CELL))
+    low, high = np.full(shape, 2 ** 30, np.int32), np.full(shape, -1, np.int32)
     # without a ray a pixel has no place in space
     depth = view.depth
-    if np.isnan(view.camera.rays).any():
+    if view.camera.has_blind_pixels:
         depth = np.where(np.isnan(view.camera.rays[..., 0]), np.float32(np.nan), depth)
-    _warp(np.ascontiguousarray(depth), scale, pad, image, bins)
-    return Warped(image.ravel(), image.shape[1], pad, bins)
+    valid = _warp(np.ascontiguousarray(depth), scale, pad, image, low, high)
+    return Warped(image.ravel(), image.shape[1], pad, low, high, valid)
 
 
-@njit(cache=True, nogil=True, error_model='numpy')
+@njit(cache=True, nogil=True, error_model='numpy', _nrt=False)
 def _warp(
-    depth: Floats, scale: Scale, pad: int, image: Floats, bins: NDArray[np.int32]
-) -> None:
-    last = np.float32((len(scale.table) - 1) / _BEYOND * 1.00001)
-    per_metre = np.float32(scale.per_metre)
+    depth: Floats, scale: Scale, pad: int, image: Floats, low: NDArray[np.int32],
+    high: NDArray[np.int32],
+) -> int:
+    table, per_metre = scale.table, np.float32(scale.per_metre)
+    last = np.float32((len(table) - 1) / _BEYOND * 1.00001)
+    valid = 0
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             at = depth[v, u] * per_metre
             if np.float32(0) < at <= last:
                 i = int(at)
-                t = scale.table[i] + (at - np.float32(i)) * (scale.table[i + 1] - scale.table[i])
+                t = table[i] + (at - np.float32(i)) * (table[i + 1] - table[i])
                 image[v + pad, u + pad] = t
-                bins[v, u] = int(t * _UNWARP)
+                bin_ = np.int32(t * _UNWARP)
+                row, column = v >> CELL_BITS, u >> CELL_BITS
+                low[row, column] = min(low[row, column], bin_)
+                high[row, column] = max(high[row, column], bin_)
+                valid += 1
+    return valid
 
 
 def empty_support(height: int, width: int) -> Support:
     """Return the support of an image before find_support fills it in."""
-    shape = (-(-height // CELL), -(-width // CELL))
-    return Support(
-        np.zeros(shape, np.int32), np.zeros(shape, np.int32), np.zeros(shape, np.uint64))
-
-
-@njit(cache=True, nogil=True)
-def depth_ranges(
-    bins: NDArray[np.int32],
-) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the least and the largest bin within each cell; 2^30 and -1 where there is none."""
-    height, width = bins.shape
     rows, columns = -(-height // CELL), -(-width // CELL)
-    low = np.full((rows, columns), 2 ** 30, np.int32)
-    high = np.full((rows, columns), -1, np.int32)
-    for v in range(height):
-        j = v // CELL
-        for u in range(width):
-            b = bins[v, u]
-            if b >= 0:
-                i = u // CELL
-                low[j, i] = min(low[j, i], b)
-                high[j, i] = max(high[j, i], b)
-    return low, high
+    cells = rows * columns + 1
+    return Support(
+        np.zeros(cells, np.int32), np.zeros(cells, np.int32), np.zeros(cells, np.uint64), columns)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def find_support(
-    bins: NDArray[np.int32], low_of: NDArray[np.int32], high_of: NDArray[np.int32], lanes: int,
-    support: Support, first: int, end: int,
+    warped_image: Warped, height: int, width: int, lanes: int, support: Support, first: int,
+    end: int,
 ) -> None:
     """
     Fill in the support of rows of cells, from first to end.
 
-    :param low_of: from depth_ranges, as high_of
     :param lanes: of the weights: a pixel counts for points half of that away
     """
-    base_of, shift_of, mask_of = support.base, support.shift, support.mask
-    rows, columns = mask_of.shape
-    height, width = bins.shape
+    image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
+    low_of, high_of = warped_image.low, warped_image.high
+    rows, columns = low_of.shape
     margin = lanes // 2
     about = -(-margin // CELL)
     reach = int(np.ceil(SUPPORT * BINS))
@@ -213,7 +211,8 @@ def find_support(
                 for column in range(max(i - about, 0), min(i + about + 1, columns)):
                     low = min(low, low_of[row, column])
                     high = max(high, high_of[row, column])
-            mask_of[j, i] = uint64(0)
+            cell = j * columns + i
+            support.mask[cell] = uint64(0)
             if high < 0:
                 continue
             base = low - reach
@@ -228,14 +227,15 @@ def find_support(
             else:
                 for v in range(max(CELL * j - margin, 0), min(CELL * (j + 1) + margin, height)):
                     for u in range(max(CELL * i - margin, 0), min(CELL * (i + 1) + margin, width)):
-                        b = bins[v, u]
-                        if b >= 0:
-                            a = uint64((b - reach - base) >> shift)
-                            c = uint64((b + reach - base) >> shift)
+                        t = image[(v + pad) * stride + u + pad]
+                        if t != INVALID:
+                            bin_ = int(t * _UNWARP)
+                            a = uint64((bin_ - reach - base) >> shift)
+                            c = uint64((bin_ + reach - base) >> shift)
                             mask |= ((uint64(2) << (c - a)) - uint64(1)) << a
-            base_of[j, i] = base
-            shift_of[j, i] = shift
-            mask_of[j, i] = mask
+            support.base[cell] = base
+            support.shift[cell] = shift
+            support.mask[cell] = mask
 
 
 @njit(cache=True, nogil=True)
@@ -250,22 +250,36 @@ def robust_starts(
     density on the ray there, without the kernel of the pixel that proposes it.
 
     :param depth: (h w,) float32, metres
-    :param pixels: (n,) flat pixel indices
+    :param pixels: (n,) flat pixel indices, ascending
     :param starts: (n,) float32, metres: the observed depths; outliers are replaced
     """
+    _robust_starts(
+        warped_image, weights, width, depth, pixels, starts, np.zeros(LANES, np.float32))
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _robust_starts(
+    warped_image: Warped, weights: Weights, width: int, depth: Floats,
+    pixels: NDArray[np.int32], starts: Floats, agreeing: Floats,
+) -> None:
     image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
     weight = weights.table
     lanes = weights.lanes
     half = lanes // 2 - 1
+    beside = -LANES  # the first of the pixels that `agreeing` speaks of
+    v, row = 0, 0  # row: flat index of its first pixel
     for n in range(len(pixels)):
-        v, u = divmod(pixels[n], width)
-        centre = (v + pad) * stride + u + pad
-        first = centre - half * stride - half
-        observed = np.float32(0)
-        for strip in range(0, lanes, LANES):
-            observed += window_strip(
-                image, first + strip, stride, weight, 0, lanes, weight, strip,
-                image[centre])
+        while pixels[n] >= row + width:
+            v, row = v + 1, row + width
+        centre = (v + pad) * stride + pixels[n] - row + pad
+        if image[centre] == INVALID:
+            continue
+        if not 0 <= centre - beside < LANES:
+            beside = centre
+            agreement(image, beside, stride, weight, half, agreeing)
+        if agreeing[centre - beside] >= _CERTAIN:
+            continue
+        observed = _share(image, stride, weight, lanes, centre, image[centre])
         observed -= weight[half] * weight[half]
         if observed >= _OUTLIER:
             continue  # no depth can have more than 1
@@ -275,12 +289,21 @@ def robust_starts(
                 at = centre + row * stride + column
                 if image[at] == INVALID or at == centre:
                     continue
-                share = np.float32(0)
-                for strip in range(0, lanes, LANES):
-                    share += window_strip(
-                        image, first + strip, stride, weight, 0, lanes, weight, strip, image[at])
+                share = _share(image, stride, weight, lanes, centre, image[at])
                 share -= weight[half + row] * weight[half + column]
                 if share > best:
                     best, best_pixel = share, pixels[n] + row * width + column
         if observed < _OUTLIER * best:
             starts[n] = depth[best_pixel]
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _share(
+    image: Floats, stride: int, weight: Floats, lanes: int, centre: int, at: np.float32
+) -> np.float32:
+    """Return the image's own density on a pixel's ray, as a share of the most there can be."""
+    first = centre - (lanes // 2 - 1) * (stride + 1)
+    share = np.float32(0)
+    for strip in range(0, lanes, LANES):
+        share += window_strip(image, first + strip, stride, weight, 0, lanes, weight, strip, at)
+    return share
