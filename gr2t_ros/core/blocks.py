@@ -14,6 +14,7 @@ from numba import int64, njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import uncounted
 from .vector import copy_eight, five_taps, ROW
 
 Floats = NDArray[np.float32]
@@ -153,7 +154,7 @@ def _rehash(
         table_block[slot] = block
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _insert(
     blocks: Blocks, size: int, keys: NDArray[np.int64], done: int, change: int,
     found: NDArray[np.int32], count: int,
@@ -177,7 +178,7 @@ def _insert(
     return size, count, len(keys)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _link(blocks: Blocks, block: int) -> None:
     """Enter a new block in its neighbours' lists, and them in its own."""
     x, y, z = place_of(blocks.key[block])
@@ -215,7 +216,7 @@ def prefilter(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
         np.zeros(12 * SIDE * SIDE, np.float32))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _prefilter(
     blocks: Blocks, chosen: NDArray[np.int32], wide: Floats, along_x: Floats, along_y: Floats
 ) -> None:
@@ -256,7 +257,7 @@ def _prefilter(
                 coefficient, int64(block) * COEFFICIENTS + ROW * row)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def copy_margins(blocks: Blocks, chosen: NDArray[np.int32]) -> None:
     """Copy the first coefficients of the chosen blocks' rows behind the rows before them."""
     for block in chosen:

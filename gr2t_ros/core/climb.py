@@ -15,11 +15,13 @@ from numba import from_dtype, njit
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import uncounted
+
 Doubles = NDArray[np.float64]
 
 INTERVAL = 4.0  # h3; the search goes this far from the start
 MAX_ITERATIONS = 50
-_TOLERANCE = 0.05  # h3; a Newton step this short is the last, and good to its cube
+_TOLERANCE = 0.04  # h3; a Newton step this short is the last, and good to its cube
 _KINK = 0.02  # h3
 
 
@@ -42,13 +44,13 @@ class Status(IntEnum):
 #   stretch      mean-shift steps in a row grow by this: between two humps they are tiny
 #   status       a Status; NOT_MARCHED while it goes on
 #   evaluations  of the density so far
-CLIMBER = from_dtype(np.dtype([
+CLIMBER: Any = from_dtype(np.dtype([
     ('start', 'f8'), ('h3', 'f8'), ('target', 'f8'), ('beta', 'f8'), ('value', 'f8'),
     ('first', 'f8'), ('second', 'f8'), ('g', 'f8'), ('stretch', 'f8'), ('careful', 'i8'),
     ('status', 'i8'), ('evaluations', 'i8')]))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def set_out(ray: Any, start: float, h3: float) -> None:
     """Put a ray at its start."""
     ray.start, ray.h3 = start, h3
@@ -58,7 +60,7 @@ def set_out(ray: Any, start: float, h3: float) -> None:
     ray.careful, ray.status, ray.evaluations = 0, 0, 0
 
 
-@njit(cache=True, nogil=True, error_model='numpy', _nrt=False)
+@uncounted(error_model='numpy')
 def climb(ray: Any, value: float, first: float, second: float, g: float) -> None:
     """
     Take in the density at the ray's target and choose the next, or end.

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .blocks import Blocks, key_of, place_of, SIDE, VOXELS, with_room
 from .camera import project_jet
+from .compiled import uncounted
 from .vector import LANES, window_strip
 from .warped import BINS, CELL, CELL_BITS, Scale, Support, Warped, Weights
 
@@ -93,7 +94,8 @@ def keys_of_view(
                 top = len(depth_of_bins) - 1
                 near = depth_of_bins[min(max(base + (start << shift), 0), top)]
                 far = depth_of_bins[min(max(base + (bit << shift), 0), top)]
-                steps = int(2.5 * (far - near) / block_size) + 1
+                steps = int(2.5 * (far - near) * per_block) + 1
+                pace = (far - near) / steps
                 stride, lines, pixel_a, pixel_b = 1, 1, 0.0, 0.0
                 if spread * far <= block_size:
                     stride = CELL if inside else 2
@@ -116,11 +118,11 @@ def keys_of_view(
                             y = (R[1, 0] * p + R[1, 1] * q + R[1, 2]) * per_block
                             z = (R[2, 0] * p + R[2, 1] * q + R[2, 2]) * per_block
                             for step in range(steps + 1):
-                                depth = near + step * (far - near) / steps
+                                depth = near + step * pace
                                 key = key_of(
                                     int(np.floor(x0 + depth * x)), int(np.floor(y0 + depth * y)),
                                     int(np.floor(z0 + depth * z)))
-                                if key == last or key == before:
+                                if key in (last, before):
                                     continue
                                 before, last = last, key
                                 if count == len(out):
@@ -172,8 +174,8 @@ def add_to_blocks(
             scale, weights, scratch)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model='numpy', _nrt=False)
-def _project(key: int, voxel: float, place: Place, rim: int, scratch: Scratch) -> None:
+@uncounted(fastmath=_FAST, error_model='numpy')
+def _project(key: np.int64, voxel: float, place: Place, rim: int, scratch: Scratch) -> None:
     """Project a block's voxels into the view; u is negative where that cannot be done."""
     R, t, camera = place.R_camera_world, place.t_camera_world, place.camera
     all_u, all_v, all_z = scratch.u, scratch.v, scratch.z
@@ -210,7 +212,7 @@ def _project(key: int, voxel: float, place: Place, rim: int, scratch: Scratch) -
                 all_v[n] = np.float32(v + rim) if seen else np.float32(-1)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model='numpy', _nrt=False)
+@uncounted(fastmath=_FAST, error_model='numpy')
 def _locate(place: Place, support: Support, scale: Scale, rim: int, scratch: Scratch) -> None:
     """Find each voxel's cell, the last one for what the view does not see, and depth sample."""
     per_metre, deepest = np.float32(scale.per_metre), np.float32(len(scale.table) - 2)
@@ -238,7 +240,7 @@ def _locate(place: Place, support: Support, scale: Scale, rim: int, scratch: Scr
         all_fraction[n] = depth_at - np.float32(sample)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model='numpy', _nrt=False)
+@uncounted(fastmath=_FAST, error_model='numpy')
 def _choose(support: Support, scale: Scale, scratch: Scratch) -> int:
     """
     List the voxels that the view's support holds; return how many there are.
@@ -260,10 +262,10 @@ def _choose(support: Support, scale: Scale, scratch: Scratch) -> int:
         bit = uint64((int64(t * to_bin) - base[cell]) >> shift[cell])
         chosen[count] = i
         count += uint64(bit < uint64(64)) & (masks[cell] >> (bit & uint64(63)))
-    return int64(count)
+    return int(count)
 
 
-@njit(cache=True, nogil=True, fastmath=_FAST, error_model='numpy', _nrt=False)
+@uncounted(fastmath=_FAST, error_model='numpy')
 def _add_windows(
     first_voxel: int, count: int, value: Floats, expected: Floats, factor_of_view: float,
     image: Warped, scale: Scale, weights: Weights, scratch: Scratch,

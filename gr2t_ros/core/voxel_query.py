@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .blocks import Blocks, COEFFICIENTS, find, key_of, with_room
 from .climb import aim, climb, CLIMBER, h3_at, INTERVAL, set_out
+from .compiled import uncounted
 from .vector import spline_jet
 
 Doubles = NDArray[np.float64]
@@ -149,9 +150,7 @@ def jets(
     _jets(state, origins, directions, distances, out, new_lanes())
 
 
-# Without numba's counting of references, a kernel can neither make arrays nor slow down where it
-# takes them out of tuples: in an inner loop the counting costs more than the evaluation.
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _jets(
     state: Lattice, origins: Doubles, directions: Doubles, distances: Doubles, out: Doubles,
     lanes: Lanes,
@@ -181,7 +180,7 @@ def march_rays(
         curvatures, statuses, counts, new_lanes())
 
 
-@njit(cache=True, nogil=True, error_model='numpy', _nrt=False)
+@uncounted(error_model='numpy')
 def _march_lanes(
     state: Lattice, bandwidth: tuple[float, float, float], chosen: NDArray[np.int64],
     pixels: NDArray[np.int32], table: Doubles, T_world_camera: Doubles, starts: Floats,

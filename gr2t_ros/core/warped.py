@@ -17,6 +17,7 @@ from numba import njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
+from .compiled import uncounted
 from .vector import agreement, LANES, window_strip
 from .view import View
 
@@ -157,7 +158,7 @@ def warped(view: View, scale: Scale, weights: Weights) -> Warped:
     return Warped(image.ravel(), image.shape[1], pad, low, high, valid)
 
 
-@njit(cache=True, nogil=True, error_model='numpy', _nrt=False)
+@uncounted(error_model='numpy')
 def _warp(
     depth: Floats, scale: Scale, pad: int, image: Floats, low: NDArray[np.int32],
     high: NDArray[np.int32],
@@ -188,7 +189,7 @@ def empty_support(height: int, width: int) -> Support:
         np.zeros(cells, np.int32), np.zeros(cells, np.int32), np.zeros(cells, np.uint64), columns)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@njit(cache=True, nogil=True)
 def find_support(
     warped_image: Warped, height: int, width: int, lanes: int, support: Support, first: int,
     end: int,
@@ -198,19 +199,38 @@ def find_support(
 
     :param lanes: of the weights: a pixel counts for points half of that away
     """
+    columns = support.columns
+    _find_support(
+        warped_image, height, width, lanes, support, first, end,
+        np.zeros(columns, np.int32), np.zeros(columns, np.int32))
+
+
+@uncounted()
+def _find_support(
+    warped_image: Warped, height: int, width: int, lanes: int, support: Support, first: int,
+    end: int, low_of: NDArray[np.int32], high_of: NDArray[np.int32],
+) -> None:
+    """
+    Find_support.
+
+    :param low_of: scratch: the least bins about a row, by columns; high_of: the largest
+    """
     image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
-    low_of, high_of = warped_image.low, warped_image.high
-    rows, columns = low_of.shape
+    rows, columns = warped_image.low.shape
     margin = lanes // 2
     about = -(-margin // CELL)
     reach = int(np.ceil(SUPPORT * BINS))
     for j in range(first, end):
+        low_of[:] = 2 ** 30
+        high_of[:] = -1
+        for row in range(max(j - about, 0), min(j + about + 1, rows)):
+            for i in range(columns):
+                low_of[i] = min(low_of[i], warped_image.low[row, i])
+                high_of[i] = max(high_of[i], warped_image.high[row, i])
         for i in range(columns):
             low, high = 2 ** 30, -1
-            for row in range(max(j - about, 0), min(j + about + 1, rows)):
-                for column in range(max(i - about, 0), min(i + about + 1, columns)):
-                    low = min(low, low_of[row, column])
-                    high = max(high, high_of[row, column])
+            for column in range(max(i - about, 0), min(i + about + 1, columns)):
+                low, high = min(low, low_of[column]), max(high, high_of[column])
             cell = j * columns + i
             support.mask[cell] = uint64(0)
             if high < 0:
@@ -257,7 +277,7 @@ def robust_starts(
         warped_image, weights, width, depth, pixels, starts, np.zeros(LANES, np.float32))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _robust_starts(
     warped_image: Warped, weights: Weights, width: int, depth: Floats,
     pixels: NDArray[np.int32], starts: Floats, agreeing: Floats,
@@ -267,11 +287,11 @@ def _robust_starts(
     lanes = weights.lanes
     half = lanes // 2 - 1
     beside = -LANES  # the first of the pixels that `agreeing` speaks of
-    v, row = 0, 0  # row: flat index of its first pixel
+    v, line = 0, 0  # line: flat index of its first pixel
     for n in range(len(pixels)):
-        while pixels[n] >= row + width:
-            v, row = v + 1, row + width
-        centre = (v + pad) * stride + pixels[n] - row + pad
+        while pixels[n] >= line + width:
+            v, line = v + 1, line + width
+        centre = (v + pad) * stride + pixels[n] - line + pad
         if image[centre] == INVALID:
             continue
         if not 0 <= centre - beside < LANES:
@@ -297,7 +317,7 @@ def _robust_starts(
             starts[n] = depth[best_pixel]
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@uncounted()
 def _share(
     image: Floats, stride: int, weight: Floats, lanes: int, centre: int, at: np.float32
 ) -> np.float32:
