@@ -90,7 +90,7 @@ def tsdf_vertices(views: Sequence[View]) -> NDArray[np.float64]:
     grid = tsdf.Tsdf(SETTINGS.voxel_size, SETTINGS.depth_max)
     for view in views:
         grid.integrate(tsdf.Frame(view))
-    return grid.vertices(TSDF_WEIGHT)
+    return grid.mesh(TSDF_WEIGHT).vertices
 
 
 def main() -> None:

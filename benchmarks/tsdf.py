@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,20 @@ INSTALLED = find_spec('open3d') is not None
 _TRUNCATION = 4.0  # voxels
 _SEEN = 0.5  # weight; below that of one frame
 _BLOCKS = 40000  # at the start; it grows
+
+
+class Mesh(NamedTuple):
+    """
+    A triangle mesh.
+
+    :param vertices: (n, 3) world, metres
+    :param faces: (m, 3) int
+    :param weight: (n,) of the vertices: about how many frames saw them
+    """
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int32]
+    weight: NDArray[np.float64]
 
 
 class Frame:
@@ -51,6 +65,7 @@ class Tsdf:
         open3d.utility.set_verbosity_level(open3d.utility.VerbosityLevel.Error)
         one = open3d.core.float32
         self._depth_max = depth_max
+        self._voxel_size = voxel_size
         self._grid = open3d.t.geometry.VoxelBlockGrid(
             ('tsdf', 'weight'), (one, one), ((1), (1)), voxel_size, 8, _BLOCKS)
         self._blocks: Any = None
@@ -69,12 +84,37 @@ class Tsdf:
         depth: NDArray[np.float32] = result['depth'].numpy()
         return depth
 
-    def vertices(self, weight: float = _SEEN) -> NDArray[np.float64]:
+    def mesh(self, weight: float = _SEEN) -> Mesh:
         """
-        Return the vertices (n, 3) of the whole mesh.
+        Return the whole mesh.
 
         :param weight: of the voxels that count; about how many frames saw them
         """
         mesh = self._grid.extract_triangle_mesh(weight)
-        positions: NDArray[np.float32] = mesh.vertex.positions.numpy()
-        return positions.astype(np.float64)
+        vertices = mesh.vertex.positions.numpy().astype(np.float64)
+        return Mesh(vertices, mesh.triangle.indices.numpy(), self._weights(vertices))
+
+    def _weights(self, vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the weights at vertices, each between two voxels of the grid: their lesser."""
+        places, flat = self._grid.voxel_coordinates_and_flattened_indices()
+        weight = self._grid.attribute('weight').numpy().reshape(-1)[flat.numpy()]
+        cells = np.rint(places.numpy() / self._voxel_size).astype(np.int64)
+        low, size = cells.min(axis=0), np.ptp(cells, axis=0) + 1
+        order = np.argsort(_numbers(cells, low, size))
+        keys, weight = _numbers(cells, low, size)[order], weight[order]
+        # a vertex lies on a line of the grid, but for rounding
+        at = vertices / self._voxel_size
+        lesser = np.full(len(vertices), np.inf)
+        for ends in (np.floor(at + 1e-3), np.ceil(at - 1e-3)):
+            number = _numbers(ends.astype(np.int64), low, size)
+            nearest = np.minimum(np.searchsorted(keys, number), len(keys) - 1)
+            lesser = np.minimum(lesser, np.where(keys[nearest] == number, weight[nearest], 0))
+        return lesser
+
+
+def _numbers(
+    cells: NDArray[np.int64], low: NDArray[np.int64], size: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """Return one number for each cell of a box."""
+    x, y, z = (cells - low).T
+    return (x * size[1] + y) * size[2] + z
