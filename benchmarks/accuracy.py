@@ -94,7 +94,7 @@ def _at_once(
     for view, rays in zip(views, all_rays):
         march(density, rays, np.arange(len(rays.pixels)), pool)
         meshes.append(view_mesh(
-            density, rays, view.camera.width, 1, settings.min_likelihood,
+            density, rays, view.camera.width, 1, settings.min_confidence,
             settings.min_edge_likelihood, pool))
     return all_rays, meshes
 

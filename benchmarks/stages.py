@@ -135,7 +135,7 @@ def _ours(
         share = len(changed) / max(len(before.pixels), 1)
     if with_mesh:
         clock(
-            'mesh', view_mesh, density, rays, view.camera.width, 1, SETTINGS.min_likelihood,
+            'mesh', view_mesh, density, rays, view.camera.width, 1, SETTINGS.min_confidence,
             SETTINGS.min_edge_likelihood, pool)
     return rays, share
 

@@ -104,6 +104,8 @@ def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):
     vertices = ball.vertices * (1 + noise[:, None] / 0.1)
     mesh = ViewMesh(
         vertices=vertices, vertex_likelihood=np.exp(-np.abs(noise) * 1e3).astype(np.float32),
+        vertex_sigma=np.ones(len(noise), np.float32),
+        vertex_confidence=np.ones(len(noise), np.float32),
         faces=ball.faces.astype(np.int32), edges=ball.edges_unique.astype(np.int32),
         edge_likelihood=np.ones(len(ball.edges_unique), np.float32))
     ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], 1.0, 'turbo')

@@ -132,7 +132,8 @@ def _check_marker(marker: Marker) -> None:
 
 
 def _check_cloud(cloud: PointCloud2) -> None:
-    assert [field.name for field in cloud.fields] == ['x', 'y', 'z', 'rgb', 'likelihood']
+    assert [field.name for field in cloud.fields] == [
+        'x', 'y', 'z', 'rgb', 'likelihood', 'sigma', 'confidence']
     assert cloud.header.frame_id == 'map'
     points = np.frombuffer(cloud.data, np.float32).reshape(-1, cloud.point_step // 4)
     assert len(points) == cloud.width * cloud.height > 100

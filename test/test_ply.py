@@ -27,6 +27,8 @@ def grid(size: int = 9, stride: int = 1, z: float = 1.0) -> ViewMesh:
     return ViewMesh(
         vertices=vertices,
         vertex_likelihood=np.linspace(1, 2, len(vertices), dtype=np.float32),
+        vertex_sigma=np.linspace(3e-4, 4e-4, len(vertices), dtype=np.float32),
+        vertex_confidence=np.linspace(0.3, 0.9, len(vertices), dtype=np.float32),
         faces=faces.astype(np.int32),
         edges=edges.astype(np.int32),
         edge_likelihood=np.linspace(3, 4, len(edges), dtype=np.float32))
@@ -53,7 +55,8 @@ def test_what_is_written_is_read_back(file: Path) -> None:
     np.testing.assert_array_equal(mesh.faces[len(one.faces):], two.faces + len(one.vertices))
     np.testing.assert_array_equal(mesh.edges[len(one.edges):], two.edges + len(one.vertices))
     np.testing.assert_array_equal(mesh.edge_likelihood, np.tile(one.edge_likelihood, 2))
-    np.testing.assert_array_equal(mesh.vertex_likelihood, np.tile(one.vertex_likelihood, 2))
+    for name in ('vertex_likelihood', 'vertex_sigma', 'vertex_confidence'):
+        np.testing.assert_array_equal(getattr(mesh, name), np.tile(getattr(one, name), 2))
     np.testing.assert_array_equal(np.unique(found.vertex_view), [4, 7])
     np.testing.assert_array_equal(
         found.vertex_colours, colours(mesh.vertex_likelihood, 2.0, 'turbo'))
@@ -65,7 +68,8 @@ def test_the_header_is_that_of_the_design(file: Path) -> None:
     colour = ['property uchar red', 'property uchar green', 'property uchar blue']
     assert [line for line in header if not line.startswith('comment')][2:] == [
         'element vertex 162', 'property float x', 'property float y', 'property float z',
-        *colour, 'property float likelihood', 'property int view',
+        *colour, 'property float likelihood', 'property float sigma', 'property float confidence',
+        'property int view',
         'element face 256', 'property list uchar int vertex_indices',
         'element gr2t_edge 416', 'property int vertex1', 'property int vertex2',
         *colour, 'property float likelihood']
@@ -129,7 +133,7 @@ def test_a_mesh_without_anything_is_a_file_too(tmp_path: Path) -> None:
 
 def test_a_view_of_which_nothing_is_left_may_be_among_them(tmp_path: Path) -> None:
     none = ViewMesh(
-        np.zeros((0, 3)), np.zeros(0, np.float32), np.zeros((0, 3), np.int32),
+        np.zeros((0, 3)), *np.zeros((3, 0), np.float32), np.zeros((0, 3), np.int32),
         np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
     written = ply.write_views(
         tmp_path / 'mesh.ply', lambda stride: [(0, none), (1, grid()), (2, none)], 2.0, 'turbo')

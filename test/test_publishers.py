@@ -27,6 +27,8 @@ def mesh(faces: int = 2, likelihood: float = 1.0) -> ViewMesh:
     return ViewMesh(
         vertices=np.column_stack([corners // 2, corners % 2, 0 * corners]).astype(float),
         vertex_likelihood=np.full(len(corners), likelihood, np.float32),
+        vertex_sigma=np.full(len(corners), 1e-3, np.float32),
+        vertex_confidence=np.full(len(corners), 0.5, np.float32),
         faces=np.column_stack([corners[:-2], corners[1:-1], corners[2:]]).astype(np.int32),
         edges=np.zeros((0, 2), np.int32), edge_likelihood=np.zeros(0, np.float32))
 
@@ -142,7 +144,8 @@ def test_a_cloud_as_viewers_read_it() -> None:
     old, new = cloud(mesh(2, 0.8), views=1), cloud(mesh(2, 0.5), views=2)
     message = point_cloud([old, new], 2, 0.5, 'turbo')
     assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
-        (name, 4 * i, 7) for i, name in enumerate(('x', 'y', 'z', 'rgb', 'likelihood'))]
+        (name, 4 * i, 7) for i, name in enumerate(
+            ('x', 'y', 'z', 'rgb', 'likelihood', 'sigma', 'confidence'))]
     points = np.frombuffer(message.data, np.float32).reshape(message.width, -1)
     np.testing.assert_array_equal(points[:4, :3], mesh(2).vertices)
     np.testing.assert_allclose(points[:, 4], [0.4] * 4 + [0.5] * 4)

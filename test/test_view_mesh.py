@@ -23,7 +23,7 @@ def mesh_of(depth, stride=1, T=None, **thresholds):
     rays = rays_of(density, view, 1, 'robust')
     march(density, rays, np.arange(len(rays.pixels)))
     return density, view_mesh(
-        density, rays, WIDTH, stride, thresholds.get('vertex', 0.02), thresholds.get('edge', 0.5))
+        density, rays, WIDTH, stride, thresholds.get('vertex', 0.19), thresholds.get('edge', 0.5))
 
 
 def test_a_whole_grid_has_all_its_edges_once_and_two_faces_a_square():
@@ -76,7 +76,7 @@ def test_a_lonely_pixel_is_removed_with_its_edges_and_faces():
     depth[10:17, 10:17] = np.nan
     depth[13, 13] = 0.53
     _, whole = mesh_of(depth, vertex=0.0)
-    _, mesh = mesh_of(depth, vertex=0.1)
+    _, mesh = mesh_of(depth)
     assert len(whole.vertices) == len(mesh.vertices) + 1
     assert mesh.vertices[:, 2].max() < 0.51
     assert mesh.faces.max() < len(mesh.vertices) and mesh.edges.max() < len(mesh.vertices)

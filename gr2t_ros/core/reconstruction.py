@@ -169,7 +169,7 @@ class Reconstruction:
         chosen = self.keyframes[keyframe]
         return view_mesh(
             self.density, chosen.rays, chosen.view.camera.width,
-            self.settings.ray_stride * stride, self.settings.min_likelihood,
+            self.settings.ray_stride * stride, self.settings.min_confidence,
             self.settings.min_edge_likelihood, self._pool)
 
     def meshes(self, stride: int = 1) -> Iterator[tuple[int, ViewMesh]]:

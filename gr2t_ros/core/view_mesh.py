@@ -9,9 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .confidence import confidences, deviations
 from .ray_march import Density, Rays
 
-ROBUST_MAXIMUM = 98.0  # percentile of the likelihoods that thresholds and colours refer to
+ROBUST_MAXIMUM = 98.0  # percentile of the likelihoods that colours refer to
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,6 +22,8 @@ class ViewMesh:
 
     :param vertices: (n, 3) float64, world, metres
     :param vertex_likelihood: (n,) float32
+    :param vertex_sigma: (n,) float32, standard deviation along the ray of its pixel, metres
+    :param vertex_confidence: (n,) float32, 0 to 1
     :param faces: (m, 3) int32, indices of vertices, anticlockwise as the camera sees them
     :param edges: (k, 2) int32, indices of vertices; each edge once
     :param edge_likelihood: (k,) float32, at the edges' barycentres
@@ -28,6 +31,8 @@ class ViewMesh:
 
     vertices: NDArray[np.float64]
     vertex_likelihood: NDArray[np.float32]
+    vertex_sigma: NDArray[np.float32]
+    vertex_confidence: NDArray[np.float32]
     faces: NDArray[np.int32]
     edges: NDArray[np.int32]
     edge_likelihood: NDArray[np.float32]
@@ -38,12 +43,12 @@ def view_mesh(
     rays: Rays,
     width: int,
     stride: int,
-    min_likelihood: float,
+    min_confidence: float,
     min_edge_likelihood: float,
     pool: Executor | None = None,
 ) -> ViewMesh:
     """
-    Join the maxima of a view's rays to a mesh and cut it where it is unlikely.
+    Join the maxima of a view's rays to a mesh and cut it where it is doubtful.
 
     Neighbours i, i+1 over j, j+1 give the edges (i, i+1), (j, j+1), (i, j), (i+1, j+1), (i, j+1)
     and two triangles (Grogan & Dahyot 2014). A removed vertex or edge takes its faces with it: the
@@ -51,17 +56,16 @@ def view_mesh(
 
     :param width: of the view's image, pixels
     :param stride: use every stride-th pixel of every stride-th row
-    :param min_likelihood: least vertex, as a fraction of the 98th percentile
+    :param min_confidence: of vertices, 0 to 1
     :param min_edge_likelihood: least edge, as a fraction of the larger of its two vertices
     """
     likelihood = rays.total / np.float32(max(density.size, 1))
-    kept = rays.converged
-    if kept.any():
-        # not in place: `converged` is made anew, but who reads this should not have to know
-        kept = kept & (
-            likelihood >= min_likelihood * np.percentile(likelihood[kept], ROBUST_MAXIMUM))
     v, u = np.divmod(rays.pixels, width)
-    kept = kept & (v % stride == 0) & (u % stride == 0)
+    found = np.flatnonzero(rays.converged & (v % stride == 0) & (u % stride == 0))
+    sigma = deviations(density, rays, found)
+    confidence = confidences(sigma, density.h3(rays.depth[found]))
+    sure = confidence >= min_confidence
+    kept, sigma, confidence = found[sure], sigma[sure], confidence[sure]
     likelihood = likelihood[kept]
     vertices = rays.points(kept)
 
@@ -95,6 +99,6 @@ def view_mesh(
         np.column_stack([corner[lower], below[lower], opposite[lower]]),
         np.column_stack([corner[upper], opposite[upper], right[upper]])])
     return ViewMesh(
-        vertices, likelihood, faces,
+        vertices, likelihood, sigma, confidence, faces,
         np.concatenate([across, down, diagonal]),
         np.concatenate([across_likelihood, down_likelihood, diagonal_likelihood]))

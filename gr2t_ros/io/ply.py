@@ -30,7 +30,8 @@ _FACES_PER_VERTEX = 1.5  # at least, of a surface without many holes
 
 _COLOUR = [('red', 'u1'), ('green', 'u1'), ('blue', 'u1')]
 _VERTEX = np.dtype([
-    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), *_COLOUR, ('likelihood', '<f4'), ('view', '<i4')])
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), *_COLOUR, ('likelihood', '<f4'),
+    ('sigma', '<f4'), ('confidence', '<f4'), ('view', '<i4')])
 _FACE = np.dtype([('vertex_indices', '<i4', (3,))])
 # not 'edge': trimesh refuses a file whose edges carry more than two vertices, and builds curves
 # out of those that do not
@@ -59,7 +60,7 @@ class PlyMesh:
     """
     A mesh read from a file of write_views.
 
-    :param mesh: its geometry and likelihoods, 1 / (px^2 m)
+    :param mesh: its geometry, likelihoods (1 / (px^2 m)), deviations (metres) and confidences
     :param vertex_colours: (n, 3) uint8, red green blue
     :param vertex_view: (n,) int32, the number of the keyframe that a vertex belongs to
     """
@@ -117,6 +118,8 @@ def _spool(
         for axis, name in enumerate('xyz'):
             vertex_rows[name] = mesh.vertices[:, axis]
         _colour(vertex_rows, mesh.vertex_likelihood, scale, colour_map)
+        vertex_rows['sigma'] = mesh.vertex_sigma
+        vertex_rows['confidence'] = mesh.vertex_confidence
         vertex_rows['view'] = view
         face_rows = np.empty(len(mesh.faces), _FACE_ROW)
         face_rows['length'] = 3
@@ -152,7 +155,7 @@ def _header(vertices: int, faces: int, edges: int) -> bytes:
         for name, dtype, count in (
             ('vertex', _VERTEX, vertices), ('face', _FACE, faces), (_EDGE_ELEMENT, _EDGE, edges))]
     text: str = PlyData(elements, byte_order='<', comments=[
-        'gr2t_ros; metres; likelihood in 1 / (px^2 m)']).header
+        'gr2t_ros; metres; likelihood in 1 / (px^2 m); confidence 0 to 1']).header
     return f'{text}\n'.encode('ascii')
 
 
@@ -169,6 +172,8 @@ def read(path: Path) -> PlyMesh:
         mesh = ViewMesh(
             vertices=np.stack([vertex[name] for name in 'xyz'], axis=-1).astype(np.float64),
             vertex_likelihood=np.array(vertex['likelihood'], np.float32),
+            vertex_sigma=np.array(vertex['sigma'], np.float32),
+            vertex_confidence=np.array(vertex['confidence'], np.float32),
             faces=np.array(face['vertex_indices'], np.int32).reshape(-1, 3),
             edges=np.stack([edge['vertex1'], edge['vertex2']], axis=-1).astype(np.int32),
             edge_likelihood=np.array(edge['likelihood'], np.float32))

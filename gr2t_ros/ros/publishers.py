@@ -28,7 +28,8 @@ _MAX_CORNERS = 400_000  # in one message: 16 MB; what is over goes with the next
 _MAX_SECONDS = 0.25  # for making one message
 _NEW_COLOURS = 0.2  # change of the colour scale with which all meshes are sent again
 _POINT = np.dtype([
-    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('rgb', '<u4'), ('likelihood', '<f4')])
+    ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('rgb', '<u4'), ('likelihood', '<f4'),
+    ('sigma', '<f4'), ('confidence', '<f4')])
 
 
 class MapPublishers:
@@ -151,6 +152,8 @@ def cloud(mesh: ViewMesh, views: int) -> NDArray[np.void]:
     for axis, name in enumerate('xyz'):
         points[name] = mesh.vertices[:, axis]
     points['likelihood'] = mesh.vertex_likelihood * views
+    points['sigma'] = mesh.vertex_sigma
+    points['confidence'] = mesh.vertex_confidence
     return points
 
 
@@ -158,7 +161,7 @@ def point_cloud(
     clouds: Sequence[NDArray[np.void]], views: int, scale: float, colour_map: str
 ) -> PointCloud2:
     """
-    Return points as a message without header: x, y, z, rgb, likelihood.
+    Return points as a message without header: x, y, z, rgb, likelihood, sigma, confidence.
 
     :param clouds: of `cloud`
     :param views: in the map
