@@ -285,12 +285,12 @@ def test_what_is_given_wins(live: Callable[..., list[dict[str, Any]]]) -> None:
     """Over the user's file, which wins over the preset."""
     node, rviz = live(
         preset='zed', rviz='true', camera='/zed2', params_file='mine.yaml', depth_max='4',
-        world_frame='12', camera_info_topic='/info', use_sim_time='true')
+        world_frame='12', camera_info_topic='/info', use_sim_time='true', cameras='[front, rear]')
     preset, file, values = node['parameters']
     assert preset.endswith('zed.yaml') and file == 'mine.yaml'
     text = values.pop('world_frame')
     assert (text.args, text.kwargs) == (('12',), {'value_type': str})
-    assert values == {'depth_max': 4.0, 'use_sim_time': True}
+    assert values == {'depth_max': 4.0, 'use_sim_time': True, 'cameras': ['front', 'rear']}
     assert type(values['depth_max']) is float
     assert dict(node['remappings']) == {
         'depth/image': '/zed2/depth/depth_registered', 'depth/camera_info': '/info',
