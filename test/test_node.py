@@ -18,8 +18,9 @@ from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
 rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseStamped  # noqa: E402
-from rclpy.qos import qos_profile_sensor_data  # noqa: E402
+from rclpy.qos import qos_profile_sensor_data, QoSProfile  # noqa: E402
 from rclpy.serialization import deserialize_message  # noqa: E402
 from rclpy.time import Time  # noqa: E402
 from ros_for_tests import Isolation, NodeProcess, Observer, plane_views, wait_until  # noqa: E402
@@ -63,6 +64,7 @@ def test_map_from_a_played_bag(
     with NodeProcess(isolation, tmp_path, '-p', 'publish_rate:=10.0') as node:
         arrays = observer.collect(MarkerArray, '/gr2t/mesh', outputs_profile(10))
         clouds = observer.collect(PointCloud2, '/gr2t/points', outputs_profile(10))
+        states = observer.collect(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
         assert not observer.call(Trigger, 'save_snapshot').success
 
         isolation.play(bag)
@@ -74,6 +76,14 @@ def test_map_from_a_played_bag(
 
         assert 'the map begins, in the frame map' in node.log
         _check_cloud(deserialize_message(clouds[-1], PointCloud2))
+        def reported() -> bool:
+            """Tell whether the newest status knows the last image."""
+            array = deserialize_message(states[-1], DiagnosticArray) if states else None
+            return bool(array) and array.status[2].values[0].value == str(FRAMES)
+
+        observer.spin_until(reported, 'diagnostics')
+        _check_diagnostics(deserialize_message(states[-1], DiagnosticArray))
+        assert re.search(r'^publish +[1-9]', observer.call(Trigger, 'timing').message, re.M)
         markers = _markers(arrays)
         for marker in markers.values():
             _check_marker(marker)
@@ -84,6 +94,7 @@ def test_map_from_a_played_bag(
         assert path.parent == node.snapshots
         assert np.abs(mesh.vertices[:, 2]).max() < FLAT
         assert f'{len(mesh.faces)} faces' in answer.message
+        assert f'likelihood {mesh.vertex_likelihood.min():.3g} to' in answer.message
         assert set(read(path).vertex_view) == set(markers)
 
         # someone who comes late gets everything
@@ -131,6 +142,17 @@ def _check_marker(marker: Marker) -> None:
     assert marker.scale.x == marker.scale.y == marker.scale.z == 1.0
 
 
+def _check_diagnostics(array: DiagnosticArray) -> None:
+    assert [item.name for item in array.status] == ['gr2t: inputs', 'gr2t: camera', 'gr2t: map']
+    assert {item.level for item in array.status} == {DiagnosticStatus.OK}, array
+    values = {item.key: item.value for status in array.status for item in status.values}
+    assert values['received'] == values['integrated'] == values['views'] == str(FRAMES)
+    assert int(values['keyframes']) > 1 and int(values['blocks']) > 10
+    assert float(values['memory (MB)']) > 50
+    assert 0 <= float(values['worker load (%)']) <= 100
+    assert {'received (Hz)', 'integrated (Hz)', 'waiting rays', 'waiting for a pose'} <= {*values}
+
+
 def _check_cloud(cloud: PointCloud2) -> None:
     assert [field.name for field in cloud.fields] == [
         'x', 'y', 'z', 'rgb', 'likelihood', 'sigma', 'confidence']
@@ -152,6 +174,25 @@ def test_signals_end_it_with_a_snapshot(
         assert len(snapshots) == 1
         assert len(read(snapshots[0]).mesh.faces) > 100
         assert f'snapshot: {snapshots[0]}' in node.log
+
+
+def test_sigint_in_the_middle_of_a_snapshot(
+    isolation: Isolation, observer: Observer, bag: Path, tmp_path: Path
+) -> None:
+    """Whole files only, and exit code 0."""
+    with NodeProcess(isolation, tmp_path) as node:
+        isolation.play(bag)
+        client = observer.node.create_client(Trigger, '/gr2t/save_snapshot')
+        observer.spin_until(client.service_is_ready, 'the service')
+        answers = [client.call_async(Trigger.Request()) for _ in range(8)]
+        observer.spin_until(answers[0].done, 'the first snapshot')
+        assert node.stop() == 0
+        for path in node.snapshots.iterdir():
+            assert len(read(path).mesh.faces) > 100
+        for item in answers:
+            if item.done():
+                answer = item.result()
+                assert answer.success or 'told to stop' in answer.message
 
 
 def test_a_signal_before_any_input(isolation: Isolation, tmp_path: Path) -> None:

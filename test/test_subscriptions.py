@@ -11,7 +11,10 @@ import pytest
 pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
+from diagnostic_msgs.msg import DiagnosticArray
 from live_for_tests import BEST_EFFORT, LiveCamera, publish_static, RELIABLE
+from rclpy.qos import QoSProfile
+from rclpy.serialization import deserialize_message
 from ros_for_tests import Isolation, NodeProcess, Observer, plane_views
 from scenes_for_tests import plane_view, pose
 from std_srvs.srv import Trigger
@@ -149,9 +152,13 @@ def test_wrong_topic_names_are_explained_once(
     """The warning names what was asked for, and what there is."""
     LiveCamera(observer, '/my_camera', source='')
     publish_static(observer, 'base', 'camera', np.eye(4))
+    states = observer.collect(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
     with NodeProcess(isolation, tmp_path, remap=()) as node:
         log = node.wait_for('ROS_DOMAIN_ID')
         assert 'nothing came for 5 s on /depth/camera_info, /depth/image' in log
+        observer.spin_until(
+            lambda: states and 'nobody publishes it' in deserialize_message(
+                states[-1], DiagnosticArray).status[0].message, 'the same in the diagnostics')
         for words in (
                 '/depth/image (sensor_msgs/msg/Image): nobody publishes it',
                 '-r depth/image:=/my_camera/depth/image',

@@ -4,6 +4,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+import re
 import threading
 import time
 from typing import Any
@@ -40,8 +41,9 @@ class Outputs:
 
     def publish(
         self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
-    ) -> None:
+    ) -> bool:
         self.published.append((frame_id, stamp_ns, views))
+        return True
 
     def clear(self, frame_id: str) -> None:
         self.cleared.append(frame_id)
@@ -144,7 +146,12 @@ def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> No
     assert rig.outputs.changed == set(range(max(rig.outputs.changed) + 1))
     assert rig.dropped == {}
     rig.worker.stop()
-    assert '5 received, 5 integrated, 0 dropped, 0 waiting' in rig.worker.summary()
+    summary = rig.worker.summary()
+    assert '5 received, 5 integrated, 0 dropped, 0 waiting' in summary
+    for stage in ('queue', 'queue and pose', 'integrate', 'march'):
+        assert re.search(rf'^{stage} +5 ', summary, re.MULTILINE), summary
+    assert 'stamp to publish' not in summary, 'the recording is old'
+    assert rig.worker.busy > 0
 
 
 def test_a_full_queue_loses_the_oldest_images(make: Callable[..., Rig]) -> None:

@@ -110,6 +110,12 @@ class Reconstruction:
         return self._density
 
     @property
+    def blocks(self) -> int:
+        """Return the number of the lattice's blocks; the first stands for none."""
+        lattice = self._density
+        return lattice.blocks.size - 1 if isinstance(lattice, VoxelDensity) else 0
+
+    @property
     def depth_max(self) -> float:
         """Return up to which depth (m) the map takes pixels, whatever the settings became."""
         lattice = self._density

@@ -47,7 +47,8 @@ class FrameAssembler:
 
     read: images read so far. dropped: images that gave no view, by reason. explanations: for each
     reason, and for poses that were left out, the sentence of the first case. world: where the
-    views are.
+    views are. waits: seconds from its receipt that each live image took to become a view, for
+    whoever empties the list.
 
     :param settings: of which the input's count
     :param world: shared with other cameras; None: its own
@@ -63,6 +64,7 @@ class FrameAssembler:
         self.read = 0
         self.dropped: Counter[str] = Counter()
         self.explanations: dict[str, str] = {}
+        self.waits: list[float] = []
         self.world = world or World(settings)
         self._settings = settings
         self._name = name
@@ -168,6 +170,8 @@ class FrameAssembler:
             if reason is None or image.stamp_ns < stamp_ns:
                 try:
                     self._views.append(self._view(image))
+                    if image.received_ns is not None:
+                        self.waits.append(1e-9 * (self._now_ns - image.received_ns))
                     continue
                 except NotYet as error:
                     reason = error

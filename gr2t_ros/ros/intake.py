@@ -14,6 +14,7 @@ from ..core.view import View
 from ..io.frames import FrameAssembler
 from ..io.world import World
 from ..settings import Settings
+from .timings import Timings
 
 MAX_MESSAGES = 20_000  # other than images that may wait: 20 s of a 1 kHz tf
 
@@ -56,10 +57,12 @@ class Intake:
     :param settings: parameters
     :param rectified: for each camera's name, whether its depth images are
     :param notify: called when there is something to do
+    :param timings: learns how long images wait
     """
 
     def __init__(
-        self, settings: Settings, rectified: Mapping[str, bool], notify: Callable[[], None]
+        self, settings: Settings, rectified: Mapping[str, bool], notify: Callable[[], None],
+        timings: Timings,
     ) -> None:
         self.world = World(settings)
         self.cameras = {
@@ -68,6 +71,7 @@ class Intake:
             for name, flag in rectified.items()}
         self._queue_size = settings.queue_size
         self._notify = notify
+        self._timings = timings
         self._lock = threading.Lock()
         # what to do with a message, and the camera if it is an image
         self._messages: deque[tuple[Callable[[], None], CameraIntake | None]] = deque()
@@ -88,7 +92,7 @@ class Intake:
                 into.lost['queue_full'] += 1
             else:
                 into.queued += 1
-            self._messages.append((lambda: into.assembler.on_depth(message, received_ns), into))
+            self._messages.append((lambda: self._feed(into, message, received_ns), into))
         self._notify()
 
     def on_camera_info(self, message: Any, camera: str = '') -> None:
@@ -145,8 +149,12 @@ class Intake:
         if feed:
             feed()
         now_ns = time.monotonic_ns()  # images may have waited for their poses long enough
-        return [
-            view for camera in self.cameras.values() for view in camera.assembler.ready(now_ns)]
+        views = []
+        for camera in self.cameras.values():
+            views += camera.assembler.ready(now_ns)
+            while camera.assembler.waits:
+                self._timings.add('queue and pose', camera.assembler.waits.pop(0))
+        return views
 
     def news(self) -> list[tuple[str, str]]:
         """Return reasons for which something was left out, with a sentence, each once."""
@@ -165,6 +173,10 @@ class Intake:
                 self._told.add((name, reason))
                 news.append((reason, f'camera {name}: {sentence}' if name else sentence))
         return news
+
+    def _feed(self, camera: CameraIntake, message: Any, received_ns: int) -> None:
+        self._timings.add('queue', 1e-9 * (time.monotonic_ns() - received_ns))
+        camera.assembler.on_depth(message, received_ns)
 
     def _enqueue(self, feed: Callable[[], None]) -> None:
         with self._lock:

@@ -21,10 +21,12 @@ from rclpy.utilities import remove_ros_args
 
 from ..core.reconstruction import warm_up
 from ..errors import InputError
+from .diagnostics import Diagnostics
 from .parameters import changed, read_parameters, table, typed
 from .publishers import MapPublishers
 from .services import Services
 from .subscriptions import check_source, rectified, Subscriptions
+from .timings import Timings
 from .worker import Worker
 
 NAME = 'gr2t'
@@ -44,11 +46,14 @@ class Gr2tNode(Node):
         check_source(self.settings)
         self._log_settings()
         self._compile()
+        timings = Timings()
         self.worker = Worker(
-            self.settings, MapPublishers(self, self.settings), self.get_logger(),
-            rectified=rectified(self, self.settings))
+            self.settings, MapPublishers(self, self.settings, timings), self.get_logger(),
+            rectified=rectified(self, self.settings), timings=timings,
+            now_ns=lambda: self.get_clock().now().nanoseconds)
         self.inputs = Subscriptions(self, self.settings, self.worker.intake)
         self.offered = Services(self, self.worker, self._pause)
+        self.diagnostics = Diagnostics(self, self.worker, self.inputs.missing)
         self.worker.start()
 
     def set_parameters_atomically(

@@ -21,6 +21,7 @@ from ..core.reconstruction import Reconstruction
 from ..core.view_mesh import ViewMesh
 from ..io.cdr import no_markers, triangle_markers, Triangles
 from ..settings import Settings
+from .timings import Timings
 
 NAMESPACE = 'mesh'
 MAX_POINTS = 2_000_000
@@ -41,10 +42,14 @@ class MapPublishers:
 
     :param node: on which to advertise
     :param settings: display_stride and colour_map count
+    :param timings: learns how long things take
     """
 
-    def __init__(self, node: Node, settings: Settings) -> None:
+    def __init__(
+        self, node: Node, settings: Settings, timings: Timings | None = None
+    ) -> None:
         self._settings = settings
+        self._timings = timings or Timings()
         self._mesh = node.create_publisher(MarkerArray, '~/mesh', outputs_profile(5))
         self._points = node.create_publisher(PointCloud2, '~/points', outputs_profile(1))
         self._listeners = {self._mesh: 0, self._points: 0}
@@ -62,9 +67,9 @@ class MapPublishers:
 
     def publish(
         self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
-    ) -> None:
+    ) -> bool:
         """
-        Send what changed to whoever listens.
+        Send what changed to whoever listens; tell whether something was sent.
 
         :param frame_id: the world frame
         :param stamp_ns: of the newest image in the map
@@ -76,15 +81,23 @@ class MapPublishers:
             self.change(everything)
         if not any(self._listeners.values()):
             self._clouds.clear()
-            return
+            return False
         if not self._waiting:
-            return
+            return False
         scale = reconstruction.colour_scale()
         # likelihoods are shares of the number of views; what they are shares of is compared
         if abs(views * scale - self._scale) > _NEW_COLOURS * self._scale:
             self._scale = views * scale
             self.change(everything)
-        meshes = self._take(reconstruction)
+        with self._timings.measure('mesh'):
+            meshes = self._take(reconstruction)
+        with self._timings.measure('publish', cpu=True):
+            self._send(meshes, frame_id, stamp_ns, views, scale)
+        return True
+
+    def _send(
+        self, meshes: dict[int, ViewMesh], frame_id: str, stamp_ns: int, views: int, scale: float
+    ) -> None:
         if self._listeners[self._mesh]:
             self._mesh.publish(triangle_markers(frame_id, NAMESPACE, [
                 triangles(keyframe, mesh, scale, self._settings.colour_map)

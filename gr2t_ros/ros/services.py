@@ -17,7 +17,7 @@ from .worker import Worker
 
 class Services:
     """
-    ~/save_snapshot, ~/reset, ~/pause.
+    ~/save_snapshot, ~/reset, ~/pause, ~/timing.
 
     :param node: that offers them
     :param worker: the map
@@ -34,6 +34,7 @@ class Services:
             callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, '~/reset', self._on_reset)
         node.create_service(SetBool, '~/pause', self._on_pause)
+        node.create_service(Trigger, '~/timing', self._on_timing)
         self._answered = node.create_guard_condition(lambda: None)
 
     async def _on_save_snapshot(
@@ -65,6 +66,11 @@ class Services:
         response.success = True
         response.message = 'the map is empty'
         self._log.info(f'reset: {response.message}')
+        return response
+
+    def _on_timing(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success = True
+        response.message = self._worker.summary()
         return response
 
     def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:

@@ -108,6 +108,12 @@ class Subscriptions:
         """Return all of them."""
         return [*self._transforms, *self._needed]
 
+    def missing(self) -> str:
+        """Return what does not arrive as lines; empty: all does, or nothing is wanted."""
+        return '' if self.paused else silence(
+            self._needed, self._transforms if self._tf_is_needed else (), _SILENCE,
+            self._intake.world.frames())
+
     def _follow_publishers(self) -> None:
         for item in self.inputs:
             if item.follow():
@@ -118,9 +124,7 @@ class Subscriptions:
 
     def _check_inputs(self) -> None:
         """Warn once when something is missing, and again only after it had come."""
-        lines = '' if self.paused else silence(
-            self._needed, self._transforms if self._tf_is_needed else (), _SILENCE,
-            self._intake.world.frames())
+        lines = self.missing()
         if lines and not self._warned:
             self._node.get_logger().warning(lines)
         self._warned = bool(lines)

@@ -3,7 +3,7 @@
 """One thread that takes the messages in their order and builds the map from them."""
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 import threading
@@ -18,8 +18,10 @@ from ..errors import FrameError, Gr2tError
 from ..io.snapshots import save_snapshot, Snapshot
 from ..settings import Settings
 from .intake import Intake
+from .timings import Timings
 
 _IDLE_STEP = 0.1  # s of marching before another look at the queue
+_SAME_CLOCK = 3600.0  # s; stamps farther from now are those of a recording
 
 
 class Log(Protocol):
@@ -43,8 +45,8 @@ class Outputs(Protocol):
 
     def publish(
         self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
-    ) -> None:
-        """Send what changed to whoever listens."""
+    ) -> bool:
+        """Send what changed to whoever listens; tell whether something was sent."""
 
     def clear(self, frame_id: str) -> None:
         """Take back all that was sent."""
@@ -65,15 +67,23 @@ class Worker:
     :param outputs: called from the worker's thread, publish_rate times a second
     :param log: likewise
     :param rectified: see Intake
+    :param timings: learns how long things take
+    :param now_ns: the time by the clock of the images' stamps
     """
 
     def __init__(
-        self, settings: Settings, outputs: Outputs, log: Log, *, rectified: Mapping[str, bool]
+        self, settings: Settings, outputs: Outputs, log: Log, *, rectified: Mapping[str, bool],
+        timings: Timings | None = None, now_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         self._settings = settings
         self._outputs = outputs
         self._log = log
-        self.intake = Intake(settings, rectified, self._notify)
+        self.timings = timings or Timings()
+        self.intake = Intake(settings, rectified, self._notify, self.timings)
+        self._now_ns = now_ns
+        self.busy = 0.0  # s
+        self.explanations: dict[str, str] = {}  # of drops by the worker itself
+        self._unseen: list[int] = []  # stamps of views that were not published yet
         self._reconstruction = Reconstruction(settings)
         self._in_map = 0  # views since the last reset
         self.waiting_rays = 0
@@ -91,7 +101,6 @@ class Worker:
         self._save_after = time.monotonic()
 
         self._told: set[str] = set()
-        self._seconds: Counter[str] = Counter()
 
     def start(self) -> None:
         """Begin."""
@@ -108,6 +117,21 @@ class Worker:
             self._wake.notify()
         self._thread.join()
         self._writer.shutdown()
+
+    @property
+    def views(self) -> int:
+        """Return the number of views in the map."""
+        return self._in_map
+
+    @property
+    def keyframes(self) -> int:
+        """Return the number of keyframes."""
+        return len(self._reconstruction.keyframes)
+
+    @property
+    def blocks(self) -> int:
+        """Return the number of the lattice's blocks."""
+        return self._reconstruction.blocks
 
     @property
     def alive(self) -> bool:
@@ -158,12 +182,7 @@ class Worker:
                 f'{camera.integrated} integrated, {dropped.total()} dropped'
                 f'{f" ({reasons})" if reasons else ""}, {camera.waiting} waiting')
         lines[-1] += f', {len(self._reconstruction.keyframes)} keyframes'
-        integrated = sum(camera.integrated for camera in self.intake.cameras.values())
-        if integrated:
-            lines.append('time: ' + ', '.join(
-                f'{stage} {1000 * seconds / integrated:.1f} ms a frame'
-                for stage, seconds in self._seconds.items()))
-        return '\n'.join(lines)
+        return '\n'.join([*lines, self.timings.table()])
 
     def _notify(self) -> None:
         with self._wake:
@@ -171,12 +190,14 @@ class Worker:
 
     def _run(self) -> None:
         while (step := self._next()) is not None:
+            began = time.perf_counter()
             try:
                 step()
                 self._publish()
                 self._save_now_and_then()
             except Exception as error:  # the thread must outlive whatever one step does
                 self._fail('the worker', error)
+            self.busy += time.perf_counter() - began
         if self._settings.snapshot_on_exit:
             try:
                 self._log.info(f'snapshot: {self._save(self._reconstruction)}')
@@ -203,7 +224,9 @@ class Worker:
 
     def _idle(self) -> None:
         if self.waiting_rays:
-            self._account(self._reconstruction.finish(_IDLE_STEP))
+            update = self._reconstruction.finish(_IDLE_STEP)
+            self.timings.add('march when idle', update.seconds['march'])
+            self._account(update)
         self._take()
 
     def _take(self) -> None:
@@ -229,11 +252,13 @@ class Worker:
                 f'the map begins, in the frame {self.intake.world.frame}: RViz\'s fixed frame '
                 'must be it, or be connected with it')
         self._stamp_ns = view.stamp_ns
+        self._unseen.append(view.stamp_ns)
+        for stage, seconds in update.seconds.items():
+            self.timings.add(stage, seconds)
         self._account(update)
 
     def _account(self, update: Update) -> None:
         self.waiting_rays = update.waiting
-        self._seconds.update(update.seconds)
         self._outputs.change(update.changed)
         for notice in update.notices:
             self._log.info(notice)
@@ -243,8 +268,13 @@ class Worker:
         if now < self._publish_at or not self.intake.world.frame:
             return
         self._publish_at = now + 1.0 / self._settings.publish_rate
-        self._outputs.publish(
-            self._reconstruction, self.intake.world.frame, self._stamp_ns, self._in_map)
+        if self._outputs.publish(
+                self._reconstruction, self.intake.world.frame, self._stamp_ns, self._in_map):
+            for stamp_ns in self._unseen:
+                latency = 1e-9 * (self._now_ns() - stamp_ns)
+                if abs(latency) < _SAME_CLOCK:
+                    self.timings.add('stamp to publish', latency)
+        self._unseen.clear()
 
     def _save_now_and_then(self) -> None:
         """Begin a snapshot every snapshot_period, if there is something new."""
@@ -271,7 +301,9 @@ class Worker:
 
         def order() -> None:
             try:
-                copy.set_result(self._reconstruction.frozen(room))
+                with self.timings.measure('copy of the map'):
+                    frozen = self._reconstruction.frozen(room)
+                copy.set_result(frozen)
             except Exception as error:  # whatever it is, who waits must get an answer
                 copy.set_exception(error)
 
@@ -285,9 +317,10 @@ class Worker:
     def _save(
         self, reconstruction: Reconstruction, interrupted: Callable[[], bool] = lambda: False
     ) -> Snapshot:
-        return save_snapshot(
-            reconstruction, self._settings.snapshot_directory, self._settings.colour_map,
-            interrupted)
+        with self.timings.measure('snapshot'):
+            return save_snapshot(
+                reconstruction, self._settings.snapshot_directory, self._settings.colour_map,
+                interrupted)
 
     def _reset(self) -> None:
         for view in self._views:
@@ -301,6 +334,7 @@ class Worker:
             self._outputs.clear(self.intake.world.frame)
 
     def _tell(self, reason: str, sentence: str) -> None:
+        self.explanations[reason] = sentence
         if reason not in self._told:
             self._told.add(reason)
             self._log.warning(f'{sentence} [{reason}: said once, then counted]')

@@ -198,9 +198,7 @@ class _Demo:
               f'median {np.median(millimetres):.2f} mm, '
               f'95 % within {np.percentile(millimetres, 95):.2f} mm '
               f'(the camera\'s noise: {1000 * NOISE.sigma:.1f} mm)')
-        for line in self._log.read_text().splitlines():
-            if 'frames: ' in line or line.startswith('time: '):
-                print(line[max(line.find('frames: '), 0):])
+        print('frames: ' + self._log.read_text().partition('frames: ')[2].rstrip())
         parts = ', '.join(f'{name} {value:.1f}' for name, value in self._seconds.items())
         print(f'seconds: {parts}, all {seconds:.1f}')
 
