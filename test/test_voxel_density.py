@@ -139,8 +139,9 @@ def with_jumps_and_holes(camera, T_world_camera):
 
 @pytest.mark.parametrize(('h1', 'voxel'), [
     (1.0, 0.008), (1.5, 0.002), (1.5, 0.008), (1.5, 0.05), (2.0, 0.008), (4.0, 0.008)])
-@pytest.mark.parametrize('camera', [Camera(61, 47, 60.0, 61.0, 30.2, 23.7), CAMERAS[3]],
-                         ids=['pinhole', 'fisheye'])
+@pytest.mark.parametrize('camera', [
+    Camera(61, 47, 60.0, 61.0, 30.2, 23.7), Camera(181, 135, 700.0, 710.0, 90.2, 67.7), CAMERAS[3],
+], ids=['pinhole', 'narrow', 'fisheye'])
 def test_no_voxel_that_matters_is_missed(camera, h1, voxel):
     """Samples equal the plain sum, at depth edges, holes and beyond the image's border too."""
     view = with_jumps_and_holes(camera, pose([0.2, -0.1, 0.3], [-0.3, 0.2, -0.4]))
@@ -148,7 +149,7 @@ def test_no_voxel_that_matters_is_missed(camera, h1, voxel):
     rng = np.random.default_rng(1)
     v, u = rng.integers(0, camera.height, 3000), rng.integers(0, camera.width, 3000)
     z = view.depth[v, u] + rng.normal(0, density.h3(view.depth[v, u]))
-    ab = camera.rays[v, u] + rng.normal(0, h1 / 60, (3000, 2))
+    ab = camera.rays[v, u] + rng.normal(0, h1 / camera.fx, (3000, 2))
     p = np.column_stack([ab * z[:, None], z])[np.isfinite(z)]
     T = view.T_world_camera
     voxels = np.unique(np.round((p @ T[:3, :3].T + T[:3, 3]) / voxel).astype(np.int64), axis=0)
