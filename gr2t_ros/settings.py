@@ -124,6 +124,11 @@ class Settings:
     input_qos: str = _parameter(
         'auto', 'Reliability of the subscriptions to images, camera_info and poses; auto: '
         'reliable where all publishers are.', choices=('auto', 'reliable', 'best_effort'))
+    use_mask: bool = _parameter(
+        False, 'Ignore pixels that are not 0 in the mask on depth/mask, such as those of the '
+        'robot itself; the node only.')
+    reset_on_time_jump: bool = _parameter(
+        False, 'Empty the map when the clock goes back, as where a recording is played in a loop.')
     queue_size: int = _parameter(
         10, 'Images that may wait for the worker; when full the oldest is dropped, and counted.',
         low=1, high=1000)

@@ -90,6 +90,14 @@ class LiveCamera:
         return stamped(message, self._frame, view.stamp_ns)
 
 
+def mask_message(pixels: np.ndarray, stamp_ns: int) -> Image:
+    """Return a mask."""
+    pixels = np.ascontiguousarray(pixels, np.uint8)
+    return stamped(Image(
+        height=pixels.shape[0], width=pixels.shape[1], encoding='mono8', step=pixels.shape[1],
+        data=array('B', pixels.tobytes())), 'camera', stamp_ns)
+
+
 def stamped(message: Any, frame: str, stamp_ns: int) -> Any:
     """Fill in a message's header, and return it."""
     message.header.frame_id = frame

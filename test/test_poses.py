@@ -237,7 +237,7 @@ class TestTransformTree:
         tree = TransformTree()
         tree.add('map', 'base', 0, pose(1))
         tree.add('base', 'camera', 0, pose(1), static=True)
-        tree.clear()
+        tree.forget(-10 * S)
         assert tree.frames() == ['base', 'camera']
 
     def test_what_was_looked_up_can_be_changed_without_harm(self):

@@ -4,6 +4,8 @@
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+import re
+import signal
 
 import numpy as np
 import pytest
@@ -12,16 +14,32 @@ pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray
-from live_for_tests import BEST_EFFORT, LiveCamera, publish_static, RELIABLE
+from live_for_tests import (
+    BEST_EFFORT,
+    LiveCamera,
+    mask_message,
+    publish_static,
+    RELIABLE,
+)
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
-from ros_for_tests import Isolation, NodeProcess, Observer, plane_views
+from ros_for_tests import (
+    Isolation,
+    LIMIT,
+    NodeProcess,
+    Observer,
+    plane_views,
+    START_NS,
+    wait_until,
+)
 from scenes_for_tests import plane_view, pose
+from sensor_msgs.msg import Image
 from std_srvs.srv import Trigger
 
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.view import View
 from gr2t_ros.io.ply import read
+from gr2t_ros.tools.recorder import record
 
 FRAMES = 4
 FLAT = 0.01  # m from the plane; beside a border kernels are one-sided
@@ -191,3 +209,64 @@ def test_an_offer_that_cannot_be_taken_and_a_wrong_world_are_explained(
             in log
         assert deaf is not None and node.stop() == 0
         assert node.log.count('offers best effort') == 2
+
+
+def test_masks_hide_pixels(
+    isolation: Isolation, observer: Observer, tmp_path: Path
+) -> None:
+    """A mask is of the image with its stamp; one of another size is said and counted."""
+    live = LiveCamera(observer)
+    masks = observer.node.create_publisher(Image, '/depth/mask', RELIABLE)
+    with NodeProcess(
+            isolation, tmp_path, '-p', 'use_mask:=true', '-p', 'queue_size:=1000', remap=()
+    ) as node:
+        observer.spin_until(
+            lambda: live.heard and masks.get_subscription_count(), 'subscribers')
+        left = np.zeros((72, 96), np.uint8)
+        left[:, :64] = 255
+        view = plane_views(1)[0]
+
+        def delivered() -> bool:
+            live.publish(view)
+            masks.publish(mask_message(left, view.stamp_ns))
+            return snapshot_is_flat(observer, node)
+
+        observer.spin_until(delivered, 'a snapshot')
+        path = max(node.snapshots.iterdir(), key=lambda path: path.stat().st_mtime_ns)
+        assert len(read(path).mesh.vertices) <= 72 * 32
+        later = replace(view, stamp_ns=view.stamp_ns + 10 ** 9)
+        live.publish(later)
+        masks.publish(mask_message(left[:9], later.stamp_ns))
+        log = node.wait_for('[mask_size: said once')
+        assert 'the mask is 96x9 pixels, but the depth image 96x72' in log
+        live.publish(replace(view, stamp_ns=view.stamp_ns + 2 * 10 ** 9))
+        node.wait_for('[no_mask: said once')
+        assert node.stop() == 0
+        assert 'no_mask 1' in node.log
+
+
+def test_a_recording_that_loops(isolation: Isolation, tmp_path: Path) -> None:
+    """With /clock and without: the map is emptied where asked, and goes on."""
+    bag = tmp_path / 'plane'
+    record(bag, [
+        replace(view, stamp_ns=START_NS + i * 500_000_000)
+        for i, view in enumerate(plane_views(9))])
+    for clock in (True, False):
+        with NodeProcess(
+                isolation, tmp_path / str(clock), '-p', f'use_sim_time:={clock}', '-p',
+                f'reset_on_time_jump:={clock}') as node:
+            player = isolation.run(
+                'gr2t_ros.ros.bag_player', bag, '--rate', 5, '--loop',
+                *(['--clock'] if clock else []))
+            try:
+                log = node.wait_for('the clock went back to 1700000000')
+                wait_until(lambda: node.log.count('the clock went back to') >= 2, 'another time')
+            finally:
+                player.send_signal(signal.SIGINT)
+                assert player.wait(LIMIT) == 130
+            assert ('the map is emptied' if clock else 'the map stays') in log
+            assert node.stop() == 0
+            received, integrated = re.search(
+                r'frames: (\d+) received, (\d+) integrated', node.log).groups()
+            assert int(received) >= 19
+            assert int(integrated) >= int(received) - 6, node.log

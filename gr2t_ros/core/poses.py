@@ -307,10 +307,15 @@ class TransformTree:
         return any(isinstance(self._links[name].poses, PoseBuffer)
                    for name in self._chain(plain(frame))[:-1])
 
-    def clear(self) -> None:
-        """Forget the past, as after a jump of the clock; static transforms, sent once, stay."""
+    def forget(self, now_ns: int) -> None:
+        """
+        Forget transforms of another time, as the clock went back; static ones, sent once, stay.
+
+        :param now_ns: the stamp that the clock went back to; what fits it stays
+        """
         self._links = {child: link for child, link in self._links.items()
-                       if not isinstance(link.poses, PoseBuffer)}
+                       if not isinstance(link.poses, PoseBuffer)
+                       or link.poses.newest_ns <= now_ns + MAX_DISORDER_NS}
 
     def _chain(self, frame: str) -> list[str]:
         """Return the frame and its ancestors up to the root."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..core.poses import HISTORY, NotYet, Pose, PoseBuffer, seconds
+from ..core.poses import HISTORY, MAX_DISORDER_NS, NotYet, Pose, PoseBuffer, seconds
 from ..errors import FrameError
 from ..settings import Settings
 from . import messages
@@ -53,6 +53,15 @@ class CameraPoses:
         self._poses.add(item.stamp_ns, item.T_parent_child)
         if error:
             raise error
+
+    def forget(self, now_ns: int) -> None:
+        """
+        Forget poses of another time.
+
+        :param now_ns: the stamp that the clock went back to
+        """
+        if len(self._poses) and self._poses.newest_ns > now_ns + MAX_DISORDER_NS:
+            self._poses = PoseBuffer(self._poses.name, self._history)
 
     def lookup(self, frame: str, stamp_ns: int) -> Pose:
         """

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.camera import Camera
-from ..core.poses import listed, NotYet, plain
+from ..core.poses import listed, MAX_DISORDER_NS, NotYet, plain, seconds
 from ..core.view import View
 from ..errors import FrameError
 from ..settings import Settings
@@ -78,6 +78,9 @@ class FrameAssembler:
         self._bad_cameras: dict[str, FrameError] = {}
         self._camera_frame = ''
         self._poses = CameraPoses(settings, self.world)
+        self._masks: dict[int, NDArray[np.bool_]] = {}  # by stamp
+        self._newest_ns = 0  # of the views, by the images' clock
+        self._older = False  # whether the last image was of another time
         self._images: deque[_Image] = deque()
         self._views: list[View] = []
 
@@ -114,6 +117,19 @@ class FrameAssembler:
             del self._cameras[oldest]
             self._bad_cameras.pop(oldest, None)
 
+    def on_mask(self, msg: Any) -> None:
+        """
+        Take a mask: of the image with its stamp, or of all where its stamp is 0.
+
+        :param msg: sensor_msgs/Image, see messages.mask
+        """
+        try:
+            self._masks[messages.stamp_ns(msg.header)] = messages.mask(msg)
+        except FrameError as error:
+            self._explain(error)
+        while len(self._masks) > 2 * self._max_waiting + 2:
+            del self._masks[next(stamp for stamp in self._masks if stamp)]
+
     def on_pose(self, msg: Any) -> None:
         """
         Take a pose message.
@@ -140,9 +156,50 @@ class FrameAssembler:
             self._drop(error)
             return
         frame, stamp_ns = plain(msg.header.frame_id), messages.stamp_ns(msg.header)
+        try:
+            self._watch_clock(stamp_ns)
+        except FrameError as error:
+            self._drop(error)
+            return
         self._images.append(_Image(depth, frame, stamp_ns, received_ns))
         if len(self._images) > self._max_waiting:
             self._sort(room=self._max_waiting)
+
+    def is_of_another_time(self, now_ns: int) -> bool:
+        """Tell whether images were taken well after a stamp, so that the clock went back to it."""
+        return self._newest_ns > now_ns + MAX_DISORDER_NS
+
+    def forget(self, now_ns: int) -> None:
+        """
+        Give up on what belongs to another time.
+
+        :param now_ns: the stamp that the clock went back to
+        """
+        images, self._images = self._images, deque()
+        for image in images:
+            if image.stamp_ns > now_ns + MAX_DISORDER_NS:
+                self._drop(FrameError(
+                    'time_jump', 'an image still waited for its pose when the clock went back to '
+                    f'{seconds(now_ns)}'))
+            else:
+                self._images.append(image)
+        self._poses.forget(now_ns)
+        self._masks = {stamp: mask for stamp, mask in self._masks.items() if not stamp}
+        self._newest_ns, self._older = 0, False
+
+    def _watch_clock(self, stamp_ns: int) -> None:
+        """Notice that the clock went back, by two images in a row: one may be a defect."""
+        if not self.is_of_another_time(stamp_ns):
+            self._older = False
+            return
+        if not self._older:
+            self._older = True
+            raise FrameError(
+                'time_jump', f'an image is of {seconds(stamp_ns)}, but one of '
+                f'{seconds(self._newest_ns)} came before: it is left out; if the next is as old, '
+                'the clock went back')
+        self.forget(stamp_ns)
+        self.world.go_back(stamp_ns)
 
     def ready(self, now_ns: int | None = None) -> list[View]:
         """
@@ -175,7 +232,8 @@ class FrameAssembler:
                     continue
                 except NotYet as error:
                     reason = error
-                    refused[image.frame] = (image.stamp_ns, error)
+                    if error.reason != 'no_mask':  # others may have theirs
+                        refused[image.frame] = (image.stamp_ns, error)
                 except FrameError as error:
                     self._drop(error)
                     continue
@@ -194,8 +252,29 @@ class FrameAssembler:
         stamp_ns = image.stamp_ns + self._offset_ns
         T_world_camera = self._poses.lookup(frame, stamp_ns)
         camera = self._camera(frame, image)
+        depth = self._unmasked(image)
+        self._newest_ns = max(self._newest_ns, image.stamp_ns)
         return View(
-            image.depth, camera, np.array(T_world_camera), stamp_ns, self._name)
+            depth, camera, np.array(T_world_camera), stamp_ns, self._name)
+
+    def _unmasked(self, image: _Image) -> NDArray[np.float32]:
+        """Make the depths that the mask hides invalid."""
+        if not self._settings.use_mask:
+            return image.depth
+        mask = self._masks.get(image.stamp_ns, self._masks.get(0))
+        if mask is None:
+            raise NotYet(
+                'no_mask', f'no mask of the image of {seconds(image.stamp_ns)} came on '
+                'depth/mask: publish it with the image\'s stamp, or one for all with stamp 0')
+        if mask.shape != image.depth.shape:
+            height, width = image.depth.shape
+            raise FrameError(
+                'mask_size', f'the mask is {mask.shape[1]}x{mask.shape[0]} pixels, but the depth '
+                f'image {width}x{height}: make masks of the depth camera\'s images')
+        image.depth[mask] = np.nan
+        if np.isnan(image.depth).all():
+            raise FrameError('no_valid_depth', 'the mask hides all valid depths of the image')
+        return image.depth
 
     def _camera(self, frame: str, image: _Image) -> Camera:
         frame = frame if frame in self._cameras else ''

@@ -127,6 +127,26 @@ def compressed_depth(msg: Any) -> NDArray[np.float32]:
     return _metres(metres)
 
 
+def mask(msg: Any) -> NDArray[np.bool_]:
+    """
+    Read a mask.
+
+    :param msg: sensor_msgs/Image of mono8 or 8UC1
+    :return: (h, w) bool, true where a pixel is to be ignored: where it is not 0
+    :raises FrameError: if it has another encoding, or was cut off
+    """
+    height, width, step = int(msg.height), int(msg.width), int(msg.step)
+    if msg.encoding not in ('mono8', '8UC1'):
+        raise FrameError(
+            'mask', f'the mask has encoding {str(msg.encoding)[:40]!r}; mono8 and 8UC1 are known')
+    if not height or step < width or len(msg.data) < step * (height - 1) + width:
+        raise FrameError('mask', f'the mask of {width}x{height} pixels with step {step} has '
+                         f'{len(msg.data)} bytes of data: its publisher writes wrong headers')
+    raw = np.ndarray((height, width), np.uint8, msg.data, strides=(step, 1))
+    result: NDArray[np.bool_] = raw != 0
+    return result
+
+
 def camera(msg: Any, *, rectified: bool) -> Camera:
     """
     Read a camera.

@@ -16,7 +16,8 @@ class World:
     What all cameras share. Not safe for use by several threads at once, but for `frames`.
 
     frame: of the views' poses; '' until it is known. tree: the transforms of tf. explanations: for
-    each reason for which a transform was left out, the sentence of the first case.
+    each reason for which a transform was left out, the sentence of the first case. went_back: the
+    stamps that the clock went back to, nanoseconds.
 
     :param settings: of which world_frame and max_wait_for_pose count
     """
@@ -25,6 +26,7 @@ class World:
         self.frame = plain(settings.world_frame)
         self.tree = TransformTree(HISTORY + settings.max_wait_for_pose)
         self.explanations: dict[str, str] = {}
+        self.went_back: list[int] = []
 
     def on_transforms(self, msg: Any, static: bool) -> None:
         """
@@ -38,6 +40,15 @@ class World:
                 self.tree.add(*item, static)
             except FrameError as error:
                 self.explanations.setdefault(error.reason, str(error))
+
+    def go_back(self, now_ns: int) -> None:
+        """
+        Forget the transforms of another time.
+
+        :param now_ns: the stamp that the clock went back to
+        """
+        self.tree.forget(now_ns)
+        self.went_back.append(now_ns)
 
     def frames(self) -> str:
         """Return the frames that tf knows, as text."""

@@ -8,7 +8,7 @@ Messages go out as the recorded bytes. Topics whose message type is not installe
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 import signal
@@ -22,9 +22,11 @@ from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
+from rclpy.time import Time
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import get_typestore, Stores
+from rosgraph_msgs.msg import Clock
 from tqdm import tqdm
 
 from ..errors import Gr2tError, InputError
@@ -45,13 +47,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         '--wait', type=float, default=10.0, metavar='S',
         help='wait at most so many seconds for a subscriber of an image topic (default: 10)')
+    parser.add_argument(
+        '--clock', action='store_true', help='also publish /clock, for nodes with use_sim_time')
+    parser.add_argument('--loop', action='store_true', help='start again at the end')
     options = parser.parse_args(arguments)
     if not options.rate > 0:
         parser.error(f'--rate must be above 0, not {options.rate:g}')
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        play(options.bag, options.rate, options.wait)
+        play(options.bag, options.rate, options.wait, clock=options.clock, loop=options.loop)
     except KeyboardInterrupt:
         return 130
     except Gr2tError as error:
@@ -60,12 +65,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def play(bag: Path, rate: float = 1.0, wait: float = 10.0) -> int:
+def play(
+    bag: Path, rate: float = 1.0, wait: float = 10.0, *, clock: bool = False, loop: bool = False,
+) -> int:
     """
     Play a recording to its end.
 
     :param rate: times the recorded speed
     :param wait: seconds for a subscriber of an image topic to appear
+    :param clock: publish /clock too
+    :param loop: again and again
     :return: the number of messages played
     :raises InputError: if it is no rosbag2 recording or none of its message types is installed
     """
@@ -84,18 +93,35 @@ def play(bag: Path, rate: float = 1.0, wait: float = 10.0) -> int:
         # SIGINT must stay Python's: rclpy's handler would end the context under the publishers
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         try:
-            return _play(reader, Node('bag_player'), rate, wait)
+            node = Node('bag_player')
+            publishers = _publishers(node, reader.connections)
+            if not publishers:
+                raise InputError(
+                    'none of the message types in the recording is installed: source ROS 2')
+            tick = _clock(node) if clock else None
+            _wait_for_subscriber(node, publishers.values(), wait)
+            played = _play(reader, publishers, rate, tick)
+            while loop:
+                played += _play(reader, publishers, rate, tick)
+            for publisher in publishers.values():
+                publisher.wait_for_all_acked(Duration(seconds=10))
+            return played
         finally:
             rclpy.try_shutdown()
     finally:
         reader.close()
 
 
-def _play(reader: AnyReader, node: Node, rate: float, wait: float) -> int:
-    publishers = _publishers(node, reader.connections)
-    if not publishers:
-        raise InputError('none of the message types in the recording is installed: source ROS 2')
-    _wait_for_subscriber(node, publishers.values(), wait)
+def _clock(node: Node) -> Callable[[int], None]:
+    """Return what publishes a time on /clock, nanoseconds."""
+    publisher = node.create_publisher(Clock, '/clock', QoSProfile(depth=10))
+    return lambda now_ns: publisher.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+
+
+def _play(
+    reader: AnyReader, publishers: Mapping[str, Publisher], rate: float,
+    tick: Callable[[int], None] | None,
+) -> int:
     connections = [item for item in reader.connections if item.topic in publishers]
     duration = (reader.end_time - reader.start_time) / 1e9 / rate
     played = 0
@@ -106,11 +132,11 @@ def _play(reader: AnyReader, node: Node, rate: float, wait: float) -> int:
         for connection, log_time, data in reader.messages(connections):
             due = started + (log_time - reader.start_time) / 1e9 / rate
             time.sleep(max(0.0, due - time.monotonic()))
+            if tick:
+                tick(log_time)
             publishers[connection.topic].publish(bytes(data))
             played += 1
             progress.update()
-    for publisher in publishers.values():
-        publisher.wait_for_all_acked(Duration(seconds=10))
     tqdm.write(f'played {played} messages in {time.monotonic() - started:.1f} s', sys.stderr)
     return played
 

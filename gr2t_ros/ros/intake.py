@@ -58,11 +58,13 @@ class Intake:
     :param rectified: for each camera's name, whether its depth images are
     :param notify: called when there is something to do
     :param timings: learns how long images wait
+    :param on_time_jump: called by take when the clock went back, with the stamp it went back to
     """
 
     def __init__(
         self, settings: Settings, rectified: Mapping[str, bool], notify: Callable[[], None],
         timings: Timings,
+        on_time_jump: Callable[[int], None],
     ) -> None:
         self.world = World(settings)
         self.cameras = {
@@ -72,6 +74,8 @@ class Intake:
         self._queue_size = settings.queue_size
         self._notify = notify
         self._timings = timings
+        self._on_time_jump = on_time_jump
+        self._jumps = 0  # that were told
         self._lock = threading.Lock()
         # what to do with a message, and the camera if it is an image
         self._messages: deque[tuple[Callable[[], None], CameraIntake | None]] = deque()
@@ -108,6 +112,23 @@ class Intake:
     def on_transforms(self, message: Any, *, static: bool) -> None:
         """Enqueue transforms."""
         self._enqueue(lambda: self.world.on_transforms(message, static))
+
+    def on_mask(self, message: Any, camera: str = '') -> None:
+        """Enqueue a mask."""
+        assembler = self.cameras[camera].assembler
+        self._enqueue(lambda: assembler.on_mask(message))
+
+    def on_clock_jump(self, now_ns: int) -> None:
+        """
+        Enqueue that the clock went back.
+
+        :param now_ns: where to; the images may have told it already
+        """
+        def tell() -> None:
+            if any(item.assembler.is_of_another_time(now_ns) for item in self.cameras.values()):
+                self.world.go_back(now_ns)
+
+        self._enqueue(tell)
 
     def update(self, settings: Settings) -> None:
         """Take parameters that may change; in the worker's thread."""
@@ -148,6 +169,12 @@ class Intake:
                     camera.queued -= 1
         if feed:
             feed()
+        if len(self.world.went_back) > self._jumps:
+            self._jumps = len(self.world.went_back)
+            stamp_ns = self.world.went_back[-1]
+            for item in self.cameras.values():
+                item.assembler.forget(stamp_ns)
+            self._on_time_jump(stamp_ns)
         now_ns = time.monotonic_ns()  # images may have waited for their poses long enough
         views = []
         for camera in self.cameras.values():

@@ -7,7 +7,8 @@ from functools import partial
 
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, TransformStamped
 from nav_msgs.msg import Odometry
-from rclpy.clock import Clock, ClockType
+from rclpy.clock import Clock, ClockType, JumpThreshold
+from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
@@ -77,6 +78,11 @@ class Subscriptions:
             item for camera in settings.cameras for item in self._of_camera(camera, settings)]
         self._tf_is_needed = settings.pose_source == 'tf'
         node.get_logger().info('subscribed to ' + ', '.join(item.topic for item in self.inputs))
+        # of use_sim_time's clock
+        self._jumps = node.get_clock().create_jump_callback(
+            JumpThreshold(
+                min_forward=None, min_backward=Duration(seconds=-1), on_clock_change=False),
+            post_callback=lambda _: intake.on_clock_jump(node.get_clock().now().nanoseconds))
         # these go on where simulated time stands still
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         node.create_timer(_FOLLOW_PERIOD, self._follow_publishers, clock=steady)
@@ -94,6 +100,11 @@ class Subscriptions:
             node, CameraInfo, relative(camera, 'depth/camera_info'),
             partial(intake.on_camera_info, camera=camera), _SMALL, once=True,
             reliability=settings.input_qos))
+        if settings.use_mask:
+            inputs.append(Input(
+                node, Image, relative(camera, 'depth/mask'),
+                partial(intake.on_mask, camera=camera), settings.queue_size, once=True,
+                reliability=settings.input_qos))
         kind, topic = Image, relative(camera, 'depth/image')
         if settings.depth_transport != 'raw':  # as image_transport: by the name that was remapped
             kind = CompressedImage

@@ -12,6 +12,7 @@ import traceback
 from typing import Any, Protocol
 
 from ..core.frozen import room_for
+from ..core.poses import seconds
 from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
 from ..errors import FrameError, Gr2tError
@@ -79,7 +80,8 @@ class Worker:
         self._outputs = outputs
         self._log = log
         self.timings = timings or Timings()
-        self.intake = Intake(settings, rectified, self._notify, self.timings)
+        self.intake = Intake(
+            settings, rectified, self._notify, self.timings, self._time_jumped)
         self._now_ns = now_ns
         self.busy = 0.0  # s
         self.explanations: dict[str, str] = {}  # of drops by the worker itself
@@ -233,6 +235,15 @@ class Worker:
         self._views.extend(self.intake.take())
         for reason, sentence in self.intake.news():
             self._log.warning(f'{sentence} [{reason}: said once, then counted]')
+
+    def _time_jumped(self, stamp_ns: int) -> None:
+        emptied = self._settings.reset_on_time_jump
+        self._log.warning(
+            f'the clock went back to {seconds(stamp_ns)}: what waited and the poses of before are '
+            'forgotten; the map ' + (
+                'is emptied' if emptied else 'stays (reset_on_time_jump:=true empties it)'))
+        if emptied:
+            self._reset()
 
     def _integrate(self, view: View) -> None:
         try:

@@ -31,7 +31,8 @@ from .results import write_results
 
 _MAX_WAITING = 100  # images, while the recording has not come to their poses yet
 # parameters of no effect here
-_LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'queue_size',
+_LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'use_mask',
+         'reset_on_time_jump', 'queue_size',
          'publish_rate', 'display_stride',
          'snapshot_directory', 'snapshot_on_exit')
 
@@ -90,7 +91,7 @@ def run(args: argparse.Namespace) -> int:
             pose=args.pose_topic, pose_source=settings.pose_source,
             world_frame=settings.world_frame)
         settings = settings.updated({
-            'pose_source': sources.poses.source,
+            'pose_source': sources.poses.source, 'use_mask': False,
             'world_frame': settings.world_frame or sources.poses.world_frame})
         directory = _output(args.output or _named_after(args.bags[0]))
         say(f'{bag.name}: {length:.1f} s, {bag.count} messages')
