@@ -12,7 +12,7 @@ import traceback
 from typing import Any, Protocol
 
 from ..core.frozen import room_for
-from ..core.poses import seconds
+from ..core import poses
 from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
 from ..errors import FrameError, Gr2tError
@@ -239,7 +239,7 @@ class Worker:
     def _time_jumped(self, stamp_ns: int) -> None:
         emptied = self._settings.reset_on_time_jump
         self._log.warning(
-            f'the clock went back to {seconds(stamp_ns)}: what waited and the poses of before are '
+            f'the clock went back to {poses.seconds(stamp_ns)}: what waited and the poses of before are '
             'forgotten; the map ' + (
                 'is emptied' if emptied else 'stays (reset_on_time_jump:=true empties it)'))
         if emptied:
