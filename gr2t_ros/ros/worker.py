@@ -11,8 +11,8 @@ import time
 import traceback
 from typing import Any, Protocol
 
-from ..core.frozen import room_for
 from ..core import poses
+from ..core.frozen import room_for
 from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
 from ..errors import FrameError, Gr2tError
@@ -239,8 +239,8 @@ class Worker:
     def _time_jumped(self, stamp_ns: int) -> None:
         emptied = self._settings.reset_on_time_jump
         self._log.warning(
-            f'the clock went back to {poses.seconds(stamp_ns)}: what waited and the poses of before are '
-            'forgotten; the map ' + (
+            f'the clock went back to {poses.seconds(stamp_ns)}: what waited and the poses of '
+            'before are forgotten; the map ' + (
                 'is emptied' if emptied else 'stays (reset_on_time_jump:=true empties it)'))
         if emptied:
             self._reset()
