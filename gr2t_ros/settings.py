@@ -141,6 +141,9 @@ class Settings:
     display_stride: int = _parameter(
         4, 'The published (not the saved) meshes use every n-th ray of every n-th row.',
         unit='px', low=1, high=64, live=True)
+    shading: bool = _parameter(
+        True, 'Faces of the published meshes turned away from a light are darker, since viewers '
+        'do not light coloured meshes; the saved ones keep pure colours.', live=True)
     snapshot_directory: str = _parameter(
         '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.', live=True)
     snapshot_period: float = _parameter(

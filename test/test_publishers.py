@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What is sent when, and how points look to a viewer."""
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,7 +19,13 @@ from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
 from gr2t_ros.ros import publishers
-from gr2t_ros.ros.publishers import cloud, MapPublishers, outputs_profile, point_cloud
+from gr2t_ros.ros.publishers import (
+    cloud,
+    MapPublishers,
+    outputs_profile,
+    point_cloud,
+    triangles,
+)
 
 
 def mesh(faces: int = 2, likelihood: float = 1.0) -> ViewMesh:
@@ -137,6 +144,46 @@ def test_colours_follow_the_scale(observer: Observer) -> None:
     outputs.change([0])
     outputs.publish(reconstruction, 'map', 0, 2)
     assert viewer.next() == {0: 3, 1: 6}
+
+
+def test_edges_for_who_wants_them(observer: Observer) -> None:
+    """Each line is an edge, in its likelihood's colour; they are deleted with the map."""
+    outputs = MapPublishers(observer.node, Settings())
+    strip = replace(
+        mesh(2), edges=np.array([[0, 1], [2, 3]], np.int32),
+        edge_likelihood=np.array([0.2, 1.0], np.float32))
+    messages = observer.collect(MarkerArray, 'observer/edges', outputs_profile(10))
+
+    def heard() -> bool:
+        outputs.publish(Map(strip), 'map', 0, 1)
+        return bool(messages)
+
+    observer.spin_until(heard, 'edges')
+    marker, = deserialize_message(messages[-1], MarkerArray).markers
+    assert (marker.type, marker.ns, marker.header.frame_id) == (Marker.LINE_LIST, 'edges', 'map')
+    np.testing.assert_array_equal(
+        [(point.x, point.y, point.z) for point in marker.points], strip.vertices[[0, 1, 2, 3]])
+    expected = np.repeat(colours(strip.edge_likelihood, 1.0, 'turbo'), 2, axis=0) / 255
+    np.testing.assert_allclose([(c.r, c.g, c.b) for c in marker.colors], expected, atol=1e-6)
+    assert 0 < marker.scale.x < 1
+    outputs.clear('map')
+    observer.spin_until(
+        lambda: deserialize_message(messages[-1], MarkerArray).markers[0].action
+        == Marker.DELETEALL, 'the deletion')
+
+
+def test_shading_shows_the_shape_and_can_be_left_out() -> None:
+    """A face towards the light keeps its colour, one that looks away is darker."""
+    strip = mesh(1)
+    towards = triangles(0, strip, 1.0, 'turbo', shading=True).colours.astype(int)
+    away = replace(strip, faces=np.ascontiguousarray(strip.faces[:, ::-1]))
+    dark = triangles(0, away, 1.0, 'turbo', shading=True).colours.astype(int)
+    pure = triangles(0, strip, 1.0, 'turbo', shading=False).colours
+    np.testing.assert_array_equal(pure, colours(strip.vertex_likelihood, 1.0, 'turbo'))
+    bright, less = sorted((towards.sum(), dark.sum()), reverse=True)
+    assert pure.astype(int).sum() >= bright > 1.4 * less > 0
+    flat = replace(strip, vertices=np.zeros_like(strip.vertices))
+    assert len(triangles(0, flat, 1.0, 'turbo', shading=True).colours) == 3
 
 
 def test_a_cloud_as_viewers_read_it() -> None:

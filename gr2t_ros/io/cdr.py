@@ -16,31 +16,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ADD, _DELETE, _DELETE_ALL = 0, 2, 3
-_TRIANGLE_LIST = 11
+_LINE_LIST, _TRIANGLE_LIST = 5, 11
 _ENCAPSULATION = b'\x00\x01\x00\x00'
 
 
 @dataclass(frozen=True, eq=False)
-class Triangles:
+class Marker:
     """
-    A mesh as visualization_msgs/Marker draws it: without indices.
+    Triangles or lines as visualization_msgs/Marker draws them: without indices.
 
-    :param id: the marker that it replaces; without corners that marker is deleted
-    :param corners: (3 m, 3) float64, metres, three a triangle
-    :param colours: (3 m, 3) uint8, red green blue
+    :param id: the marker that it replaces; without points that marker is deleted
+    :param points: (n, 3) float64, metres, three a triangle, two a line
+    :param colours: (n, 3) uint8, red green blue
+    :param width: of lines, metres; None: triangles
     """
 
     id: int
-    corners: NDArray[np.float64]
+    points: NDArray[np.float64]
     colours: NDArray[np.uint8]
+    width: float | None = None
 
 
-def triangle_markers(frame_id: str, namespace: str, meshes: Sequence[Triangles]) -> bytes:
-    """Return the MarkerArray that replaces or deletes one marker for each mesh."""
+def marker_array(frame_id: str, namespace: str, items: Sequence[Marker]) -> bytes:
+    """Return the MarkerArray that replaces or deletes each of the markers."""
     message = _Message()
-    message.numbers('<I', len(meshes))
-    for mesh in meshes:
-        _marker(message, frame_id, namespace, mesh, _ADD if len(mesh.corners) else _DELETE)
+    message.numbers('<I', len(items))
+    for item in items:
+        _marker(message, frame_id, namespace, item, _ADD if len(item.points) else _DELETE)
     return message.whole()
 
 
@@ -48,29 +50,30 @@ def no_markers(frame_id: str, namespace: str) -> bytes:
     """Return the MarkerArray that deletes all markers."""
     message = _Message()
     message.numbers('<I', 1)
-    nothing = Triangles(0, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    nothing = Marker(0, np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     _marker(message, frame_id, namespace, nothing, _DELETE_ALL)
     return message.whole()
 
 
 def _marker(
-    message: _Message, frame_id: str, namespace: str, mesh: Triangles, action: int
+    message: _Message, frame_id: str, namespace: str, item: Marker, action: int
 ) -> None:
     # without a stamp, and locked to its frame, a viewer draws it where that frame is now
     message.numbers('<iI', 0, 0)
     message.text(frame_id)
     message.text(namespace)
-    message.numbers('<iii', mesh.id, _TRIANGLE_LIST, action)
+    message.numbers(
+        '<iii', item.id, _TRIANGLE_LIST if item.width is None else _LINE_LIST, action)
     message.numbers('<7d', 0, 0, 0, 0, 0, 0, 1)  # pose
-    message.numbers('<3d', 1, 1, 1)  # scale
+    message.numbers('<3d', 1 if item.width is None else item.width, 1, 1)  # scale
     message.numbers('<4f', 0, 0, 0, 1)  # colour: its alpha multiplies those below
     message.numbers('<iI', 0, 0)  # lifetime: for ever
     message.numbers('<?', True)  # frame_locked
-    message.numbers('<I', len(mesh.corners))
-    message.array(mesh.corners, '<f8')
-    message.numbers('<I', len(mesh.colours))
-    rgba = np.ones((len(mesh.colours), 4), np.float32)
-    rgba[:, :3] = mesh.colours / np.float32(255.0)
+    message.numbers('<I', len(item.points))
+    message.array(item.points, '<f8')
+    message.numbers('<I', len(item.colours))
+    rgba = np.ones((len(item.colours), 4), np.float32)
+    rgba[:, :3] = item.colours / np.float32(255.0)
     message.array(rgba, '<f4')
     message.text('')  # texture_resource
     message.numbers('<iI', 0, 0)  # texture: header, format, data

@@ -19,14 +19,17 @@ from visualization_msgs.msg import MarkerArray
 from ..core.colour import colours
 from ..core.reconstruction import Reconstruction
 from ..core.view_mesh import ViewMesh
-from ..io.cdr import no_markers, triangle_markers, Triangles
+from ..io.cdr import Marker, marker_array, no_markers
 from ..settings import Settings
 from .timings import Timings
 
-NAMESPACE = 'mesh'
+NAMESPACE, EDGES = 'mesh', 'edges'
 MAX_POINTS = 2_000_000
 _MAX_CORNERS = 400_000  # in one message: 16 MB; what is over goes with the next
 _MAX_SECONDS = 0.25  # for making one message
+_LINE = 0.1  # width of a line, of the median edge
+_LIGHT = np.array([0.36, 0.48, 0.8])  # towards it, in the world: shared faces of views look alike
+_DARKEST = 0.45  # what a face turned away from the light keeps of its colour
 _NEW_COLOURS = 0.2  # change of the colour scale with which all meshes are sent again
 _POINT = np.dtype([
     ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('rgb', '<u4'), ('likelihood', '<f4'),
@@ -35,13 +38,16 @@ _POINT = np.dtype([
 
 class MapPublishers:
     """
-    ~/mesh: one TRIANGLE_LIST for each keyframe. ~/points: the vertices of all of them.
+    The topics ~/mesh, ~/edges and ~/points.
+
+    One TRIANGLE_LIST for each keyframe; one LINE_LIST for each, every edge in its own likelihood's
+    colour; the vertices of all of them.
 
     Meshes that changed are sent again, those that wait longest first, as many as fit one message;
     all of them where someone new listens. Nothing is computed while nobody does.
 
     :param node: on which to advertise
-    :param settings: display_stride and colour_map count
+    :param settings: display_stride, colour_map and shading count
     :param timings: learns how long things take
     """
 
@@ -52,7 +58,8 @@ class MapPublishers:
         self._timings = timings or Timings()
         self._mesh = node.create_publisher(MarkerArray, '~/mesh', outputs_profile(5))
         self._points = node.create_publisher(PointCloud2, '~/points', outputs_profile(1))
-        self._listeners = {self._mesh: 0, self._points: 0}
+        self._edges = node.create_publisher(MarkerArray, '~/edges', outputs_profile(5))
+        self._listeners = {self._mesh: 0, self._points: 0, self._edges: 0}
         self._waiting: dict[int, None] = {}  # keyframes, in order
         self._clouds: dict[int, NDArray[np.void]] = {}  # of each keyframe; see cloud
         self._scale = 0.0
@@ -76,7 +83,7 @@ class MapPublishers:
         :param views: in the map
         """
         everything = range(len(reconstruction.keyframes))
-        appeared = [self._appeared(publisher) for publisher in (self._mesh, self._points)]
+        appeared = [self._appeared(publisher) for publisher in self._listeners]
         if any(appeared):
             self.change(everything)
         if not any(self._listeners.values()):
@@ -99,8 +106,13 @@ class MapPublishers:
         self, meshes: dict[int, ViewMesh], frame_id: str, stamp_ns: int, views: int, scale: float
     ) -> None:
         if self._listeners[self._mesh]:
-            self._mesh.publish(triangle_markers(frame_id, NAMESPACE, [
-                triangles(keyframe, mesh, scale, self._settings.colour_map)
+            self._mesh.publish(marker_array(frame_id, NAMESPACE, [
+                triangles(
+                    keyframe, mesh, scale, self._settings.colour_map, self._settings.shading)
+                for keyframe, mesh in meshes.items()]))
+        if self._listeners[self._edges]:
+            self._edges.publish(marker_array(frame_id, EDGES, [
+                lines(keyframe, mesh, scale, self._settings.colour_map)
                 for keyframe, mesh in meshes.items()]))
         if self._listeners[self._points]:
             self._clouds.update(
@@ -115,6 +127,7 @@ class MapPublishers:
         self._clouds.clear()
         self._scale = 0.0
         self._mesh.publish(no_markers(frame_id, NAMESPACE))
+        self._edges.publish(no_markers(frame_id, EDGES))
         self._send_points(point_cloud([], 0, 0.0, self._settings.colour_map), frame_id, 0)
 
     def _appeared(self, publisher: Publisher) -> bool:
@@ -147,11 +160,39 @@ def outputs_profile(depth: int) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def triangles(marker: int, mesh: ViewMesh, scale: float, colour_map: str) -> Triangles:
-    """Return a mesh as a marker has it: each triangle's three corners written out."""
+def triangles(
+    marker: int, mesh: ViewMesh, scale: float, colour_map: str, shading: bool
+) -> Marker:
+    """
+    Return a mesh as a marker has it: each triangle's three corners written out.
+
+    :param shading: whether faces turned away from a light of the world are darker: viewers do not
+        light what has colours of its own, and without it no shape is seen
+    """
     corners = mesh.faces.reshape(-1)
-    colour = colours(mesh.vertex_likelihood, scale, colour_map)
-    return Triangles(marker, mesh.vertices[corners], colour[corners])
+    points = mesh.vertices[corners]
+    colour = colours(mesh.vertex_likelihood, scale, colour_map)[corners]
+    if shading:
+        colour = (colour * np.repeat(_brightness(points), 3)[:, None]).astype(np.uint8)
+    return Marker(marker, points, colour)
+
+
+def _brightness(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return Lambert's factor of each face, from _DARKEST to 1."""
+    a, b, c = corners.reshape(-1, 3, 3).astype(np.float32).transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    length = np.maximum(np.sqrt(np.einsum('ij,ij->i', normal, normal)), np.float32(1e-20))
+    cosine = normal @ _LIGHT.astype(np.float32) / length
+    return np.float32(_DARKEST) + np.float32((1 - _DARKEST) / 2) * (1 + np.clip(cosine, -1, 1))
+
+
+def lines(marker: int, mesh: ViewMesh, scale: float, colour_map: str) -> Marker:
+    """Return a mesh's edges as a marker has them."""
+    points = mesh.vertices[mesh.edges.reshape(-1)]
+    lengths = np.linalg.norm(points[1::2] - points[::2], axis=1)
+    colour = colours(mesh.edge_likelihood, scale, colour_map)
+    width = _LINE * float(np.median(lengths)) if len(lengths) else 1.0
+    return Marker(marker, points, np.repeat(colour, 2, axis=0), width)
 
 
 def cloud(mesh: ViewMesh, views: int) -> NDArray[np.void]:
