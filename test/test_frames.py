@@ -203,6 +203,32 @@ class TestPoseFromTf:
         np.testing.assert_allclose(views[-1].T_world_camera, at(0.9), atol=1e-9)
 
 
+    def corrected(self, steps, **settings):
+        """Return frames that got map -> odom with these steps, and an odom that moves."""
+        frames = assembler(world_frame='map', **settings)
+        x = 0.0
+        for i, step in enumerate(steps):
+            x += step
+            frames.world.on_transforms(tf(
+                transform('map', 'odom', i * 50 * MS, at(x)),
+                transform('odom', 'camera', i * 50 * MS, at(0.1 * i))), False)
+            frames.on_depth(depth(i * 50 * MS))
+            frames.ready()
+        return frames
+
+    def test_a_world_that_jumps_is_noticed(self):
+        frames = self.corrected([0, 0, 0, 0, 0.12, 0, 0, 0])
+        assert frames.world.explanations['world_jump'].startswith(
+            'frame odom jumped by 0.12 m and 0.0 degrees in map about 0.250 s')
+        assert 'set world_frame to odom' in frames.world.explanations['world_jump']
+
+    @pytest.mark.parametrize('steps', [
+        [0, 0, 0, 0.02, 0, 0, 0.02, 0, 0],
+        [0, 0.05, 0.1, 0.15, 0.2, 0.15, 0.1, 0.05, 0], [0.2] * 9])
+    def test_small_corrections_and_fast_robots_are_no_jumps(self, steps):
+        assert not self.corrected(steps).world.explanations
+
+
 class TestWaiting:
 
     def test_too_many_drop_the_oldest(self):

@@ -307,6 +307,13 @@ class TransformTree:
         return any(isinstance(self._links[name].poses, PoseBuffer)
                    for name in self._chain(plain(frame))[:-1])
 
+    def moving(self, target: str, source: str) -> list[str]:
+        """Return the frames between two whose transform to their parent can change, from below."""
+        up, down = self._chain(plain(source)), self._chain(plain(target))
+        return [frame for frame in [*(name for name in up if name not in down),
+                                    *(name for name in down if name not in up)]
+                if frame in self._links and isinstance(self._links[frame].poses, PoseBuffer)]
+
     def forget(self, now_ns: int) -> None:
         """
         Forget transforms of another time, as the clock went back; static ones, sent once, stay.

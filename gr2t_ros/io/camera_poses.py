@@ -97,6 +97,7 @@ class CameraPoses:
             f' to {root}, the root above {frame}' if root != frame else '')
         T_world_camera = self._world.transform(world, frame, stamp_ns, hint)
         self._world.frame = world
+        self._world.watch(frame)
         return T_world_camera
 
     def _by_message(self, frame: str, stamp_ns: int) -> Pose:

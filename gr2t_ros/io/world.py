@@ -5,10 +5,13 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..core.poses import HISTORY, listed, NotYet, plain, Pose, TransformTree
+import numpy as np
+
+from ..core.poses import HISTORY, listed, NotYet, plain, Pose, seconds, TransformTree
 from ..errors import FrameError
 from ..settings import Settings
 from . import messages
+from .jumps import JumpWatch
 
 
 class World:
@@ -27,6 +30,7 @@ class World:
         self.tree = TransformTree(HISTORY + settings.max_wait_for_pose)
         self.explanations: dict[str, str] = {}
         self.went_back: list[int] = []
+        self._watched: dict[str, JumpWatch] = {}  # of frames between the world and a camera
 
     def on_transforms(self, msg: Any, static: bool) -> None:
         """
@@ -40,6 +44,8 @@ class World:
                 self.tree.add(*item, static)
             except FrameError as error:
                 self.explanations.setdefault(error.reason, str(error))
+            if not static and item.child in self._watched:
+                self._look_for_jump(item)
 
     def go_back(self, now_ns: int) -> None:
         """
@@ -53,6 +59,23 @@ class World:
     def frames(self) -> str:
         """Return the frames that tf knows, as text."""
         return listed(self.tree.frames())
+
+    def watch(self, camera_frame: str) -> None:
+        """Notice from now on where a transform between the world and a camera jumps."""
+        for frame in self.tree.moving(self.frame, camera_frame):
+            self._watched.setdefault(frame, JumpWatch())
+
+    def _look_for_jump(self, item: messages.StampedPose) -> None:
+        jump = self._watched[item.child].add(item.stamp_ns, item.T_parent_child)
+        if jump is None:
+            return
+        way = (
+            f'set world_frame to {item.child}, which does not jump' if len(self._watched) > 1
+            else 'take the poses of an odometry that does not jump, where there is one')
+        self.explanations.setdefault('world_jump', (
+            f'frame {item.child} jumped by {jump[0]:.2f} m and {np.degrees(jump[1]):.1f} degrees '
+            f'in {item.parent} about {seconds(item.stamp_ns)}, as where SLAM corrects itself: '
+            f'what is in the map stays where it was, and surfaces may stand twice; {way}'))
 
     def transform(self, target: str, source: str, stamp_ns: int, hint: str) -> Pose:
         """
