@@ -36,16 +36,15 @@ def deviations(density: Density, rays: Rays, which: NDArray[np.int64]) -> Floats
     :param which: (n,) int64, indices of rays that have found their maximum
     :return: float32, metres of depth; infinite where the density is not curved downwards
     """
-    depth = rays.depth[which].astype(np.float64)
-    directions = rays.directions(which)
-    origins = np.broadcast_to(rays.origin, directions.shape)
-    f, _, f2 = density.along(origins, directions, depth)
-    h3 = density.h3(depth)
-    width = np.sqrt(np.divide(-f, f2, out=np.full(len(f), np.inf), where=f2 < 0)) / h3
+    f = rays.total[which] / max(density.size, 1)
+    f2 = rays.curvature[which] / max(density.size, 1)
+    h3 = density.h3(rays.depth[which]).astype(np.float32)
+    width = np.sqrt(np.divide(-f, f2, out=np.full_like(f, np.inf), where=f2 < 0)) / h3
     pixels = rays.table.shape[0] * rays.table.shape[1]
     # a view's share where it sees a plane that faces it
     share = 1.0 / (sqrt(2 * pi) * max(density.size, 1) * pixels * h3)
-    views = np.maximum(_expected_peak(density, origins + depth[:, None] * directions) / share, 1.0)
+    peak = _expected_peak(density, rays.points(which)).astype(np.float32)
+    views = np.maximum(peak / share, 1.0)
     agreement = f / (share * views)
     with np.errstate(divide='ignore', invalid='ignore'):
         sigma = h3 * _SCALE * _FITTED_AT / density.pixel_bandwidth * (

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import exact_density, voxel_query
-from .climb import INTERVAL, Status
+from .climb import aim, INTERVAL, Status
 from .exact_density import ExactDensity
 from .view import View
 from .voxel_density import VoxelDensity
@@ -79,14 +79,25 @@ class Rays:
 
     def directions(self, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Doubles:
         """Return (n, 3) float64, world, of the length that makes the distance the depth."""
-        ab = self.table.reshape(-1, 2)[self.pixels[which]]
-        R = self.T_world_camera[:3, :3]
-        return np.ascontiguousarray(ab @ R[:, :2].T + R[:, 2])
+        pixels = self.pixels[which]
+        directions = np.zeros((len(pixels), 3))
+        _aim_all(self.table, self.T_world_camera, pixels, directions)
+        return directions
 
     def points(self, which: slice | NDArray[np.bool_] | NDArray[np.int64]) -> Doubles:
         """Return the points found on some rays, (n, 3) float64, world, metres."""
-        found = self.depth[which].astype(np.float64)[:, None]
-        return self.origin + found * self.directions(which)
+        points = self.directions(which)
+        points *= self.depth[which][:, None]
+        points += self.origin
+        return points
+
+
+@njit(cache=True, nogil=True)
+def _aim_all(
+    table: Doubles, T_world_camera: Doubles, pixels: NDArray[np.int32], directions: Doubles
+) -> None:
+    for n in range(len(pixels)):
+        aim(table, T_world_camera, pixels[n], directions[n])
 
 
 def rays_of(

@@ -77,11 +77,11 @@ def view_mesh(
 
     def edges_to(other: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         exists = (corner >= 0) & (other >= 0)
-        pairs = np.column_stack([corner[exists], other[exists]])
+        first, second = corner[exists], other[exists]
         middle = density.likelihood(
-            0.5 * (vertices[pairs[:, 0]] + vertices[pairs[:, 1]]), pool).astype(np.float32)
-        likely = middle >= min_edge_likelihood * likelihood[pairs].max(axis=1, initial=0)
-        return pairs[likely], middle[likely]
+            0.5 * (vertices.take(first, 0) + vertices.take(second, 0)), pool).astype(np.float32)
+        likely = middle >= min_edge_likelihood * np.maximum(likelihood[first], likelihood[second])
+        return np.column_stack([first[likely], second[likely]]), middle[likely]
 
     (across, across_likelihood), (down, down_likelihood), (diagonal, diagonal_likelihood) = (
         edges_to(right), edges_to(below), edges_to(opposite))
