@@ -165,7 +165,7 @@ def test_displays_get_what_was_sent_before_they_started() -> None:
     displays = {
         item['Topic']['Value']: item['Topic']
         for item in content['Visualization Manager']['Displays'] if 'Topic' in item}
-    assert displays.keys() == {'/gr2t/mesh', '/gr2t/points'}
+    assert displays.keys() == {'/gr2t/mesh', '/gr2t/edges', '/gr2t/points'}
     for topic in displays.values():
         assert topic['Durability Policy'] == 'Transient Local'
         assert topic['Reliability Policy'] == 'Reliable'
