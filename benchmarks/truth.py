@@ -78,18 +78,22 @@ class Truth:
         return float(np.mean(
             Surface(found.vertices[found.faces]).distances(self.samples) <= within))
 
-    def steps(self, view: View, across: int, down: int) -> tuple[Doubles, Doubles]:
+    def steps(
+        self, view: View, pixels: NDArray[np.int64], across: int, down: int
+    ) -> tuple[Doubles, Doubles]:
         """
-        Return how the true depth changes from each pixel to a neighbour.
+        Return how the true depth changes from pixels to a neighbour each.
 
+        :param pixels: (n,) flat indices
         :param across: columns to the neighbour, down: rows
-        :return: (h, w) the largest step between neighbouring parts of the way, metres, infinite
-            where a part hits nothing; (h, w) the whole change
+        :return: (n,) the largest step between neighbouring parts of the way, metres, infinite
+            where a part hits nothing; (n,) the whole change
         """
         camera = view.camera
         to = np.array([across / camera.fx, down / camera.fy])
+        rays = camera.rays.reshape(-1, 1, 2)[pixels]
         depths = np.stack([
-            self.caster.cast(view.T_world_camera, camera.rays + part / _PARTS * to)[0]
+            self.caster.cast(view.T_world_camera, rays + part / _PARTS * to)[0][:, 0]
             for part in range(_PARTS + 1)])
         steps = np.abs(np.diff(depths, axis=0))
         largest = np.where(np.isnan(steps), np.inf, steps).max(axis=0)

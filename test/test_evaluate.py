@@ -14,7 +14,7 @@ from gr2t_ros.errors import InputError
 from gr2t_ros.io import ply
 from gr2t_ros.tools import cli
 from gr2t_ros.tools.distance import Surface
-from gr2t_ros.tools.evaluate import confidence_curve, evaluate, likelihoods
+from gr2t_ros.tools.evaluate import confidence_curve, evaluate, likelihoods, nause
 from gr2t_ros.tools.scenes import tabletop
 from gr2t_ros.tools.simulate import load_mesh
 
@@ -96,6 +96,17 @@ def test_the_confidence_curve_falls_where_likelihood_tells_errors():
     assert np.all(np.diff([point.mean_m for point in curve]) > 0)
     nothing_known = confidence_curve(error, np.full(1000, np.nan))
     assert nothing_known[-1].mean_m == pytest.approx(0.005)
+
+
+def test_nause_is_0_for_the_true_order_and_about_1_for_a_random_one():
+    rng = np.random.default_rng(0)
+    error = rng.exponential(1.0, 20_000)
+    assert nause(error, -error) == pytest.approx(0.0, abs=1e-12)
+    assert nause(error, rng.random(20_000)) == pytest.approx(1.0, abs=0.05)
+    assert nause(error, error) > 1.5
+    assert nause(np.ones(10), np.arange(10)) == 0.0  # nothing to order
+    unknown = np.where(error > np.median(error), np.nan, 1.0)
+    assert nause(error, unknown) < 0.5
 
 
 def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):

@@ -153,6 +153,30 @@ def confidence_curve(distance: ArrayLike, likelihood: ArrayLike) -> tuple[MostLi
     return tuple(MostLikely(tenth / 10, float(mean)) for tenth, mean in enumerate(means, 1))
 
 
+def nause(distance: ArrayLike, score: ArrayLike) -> float:
+    """
+    Return how well a score orders vertices: 0 as their distances do, 1 as a random order does.
+
+    The normalised area under the sparsification error: the mean distance of the best 1 %, 2 % ...
+    of the vertices, averaged, between what the true order and what a random order gives.
+
+    :param distance: (n,) metres
+    :param score: (n,) more is better; NaN counts as the least
+    """
+    error = np.asarray(distance, np.float64)
+    ranks = np.nan_to_num(np.asarray(score, np.float64), nan=-np.inf, posinf=np.inf)
+    counts = np.maximum(np.arange(1, 101) * len(error) // 100, 1)
+
+    def area(order: NDArray[np.int64]) -> float:
+        return float(np.mean(np.cumsum(error[order])[counts - 1] / counts))
+
+    oracle = area(np.argsort(error, kind='stable'))
+    random = float(error.mean())
+    if random == oracle:
+        return 0.0
+    return (area(np.argsort(-ranks, kind='stable')) - oracle) / (random - oracle)
+
+
 def likelihoods(mesh: trimesh.Trimesh) -> NDArray[np.float64] | None:
     """Return the vertices' property `likelihood` of a PLY file, (n,); None if there is none."""
     vertex = mesh.metadata.get('_ply_raw', {}).get('vertex', {}).get('data')

@@ -1,0 +1,305 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+Accuracy and confidence under several kinds of noise: 12 simulated views of a mesh.
+
+    python benchmarks/regimes.py bunny.ply [--exact] [--only NOISE ...] [--json out.json]
+
+Beside it, where it is installed, Open3D's TSDF of the same images with the same voxels, truncation
+4 voxels, weight >= 3. docs/results.md says what the columns mean.
+"""
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from contextlib import closing
+from dataclasses import dataclass
+import json
+from pathlib import Path
+from typing import Any
+
+from common import machine, table
+import numpy as np
+from numpy.typing import NDArray
+import trimesh
+from truth import Geometry, Truth
+import tsdf
+
+from gr2t_ros.core.confidence import confidences, deviations
+from gr2t_ros.core.ray_march import rays_of
+from gr2t_ros.core.reconstruction import Keyframe, Reconstruction, warm_up
+from gr2t_ros.core.view import View
+from gr2t_ros.settings import Settings
+from gr2t_ros.tools.evaluate import nause
+from gr2t_ros.tools.noise import Noise
+from gr2t_ros.tools.simulate import load_mesh, simulated_views
+
+VIEWS = 12
+KEPT = 0.7365  # share of the vertices that Grogan & Dahyot (2014) keep
+NEAR = 0.001  # metres
+TSDF_WEIGHT = 2.5  # three views
+_JUMP = 4.0  # h3; smaller steps are no depth discontinuity to the method
+_WIDE = 20.0  # h3
+_SMOOTH = 0.5  # of the whole change; a larger part of it in one eighth of a pixel is a jump
+
+
+@dataclass(frozen=True)
+class Regime:
+    """
+    A kind of noise, and how it is mapped.
+
+    :param noise: of the sensor
+    :param distance: of the cameras, metres
+    :param h3: bandwidth along the depth and voxel size, metres
+    :param sigma: the noise's standard deviation along the depth, metres
+    """
+
+    noise: Noise | None
+    distance: float
+    h3: float
+    sigma: float
+
+    def settings(self, **changes: Any) -> Settings:
+        """Return settings with which every view owns a mesh; the rest at its default."""
+        return Settings(
+            depth_bandwidth=self.h3, depth_bandwidth_quadratic=0.0, voxel_size=self.h3,
+            keyframe_translation=0.0, remarch_budget=0.0).updated(changes)
+
+    def views(self, mesh: trimesh.Trimesh, seed: int) -> list[View]:
+        """Return the simulated views."""
+        return simulated_views(mesh, VIEWS, self.distance, noise=self.noise, seed=seed)
+
+
+REGIMES = {
+    'none': Regime(None, 0.35, 0.001, 0.0),
+    '1 mm': Regime(Noise('gaussian', 0.001), 0.35, 0.001, 0.001),
+    '2 mm': Regime(Noise('gaussian', 0.002), 0.35, 0.002, 0.002),
+    '1 mm, 5 % outliers': Regime(Noise('gaussian', 0.001, 0.05), 0.35, 0.001, 0.001),
+    'kinect, 0.8 m': Regime(Noise('kinect'), 0.8, 0.0015, 0.0015),
+    'kinect, 1.5 m': Regime(Noise('kinect'), 1.5, 0.0035, 0.0035),
+}
+Row = dict[str, Any]
+
+
+class Found:
+    """
+    The maxima of all rays, before any threshold.
+
+    :param error: (n,) distance to the surface, metres
+    :param along: (n,) error along the ray, metres; NaN where the ray hits nothing
+    """
+
+    def __init__(self, reconstruction: Reconstruction, truth: Truth) -> None:
+        density = reconstruction.density
+        parts: list[tuple[NDArray[Any], ...]] = []
+        for keyframe in reconstruction.keyframes:
+            rays = keyframe.rays
+            which = np.flatnonzero(rays.converged)
+            sigma = deviations(density, rays, which)
+            true = truth.depth(keyframe.view).reshape(-1)[rays.pixels[which]]
+            parts.append((
+                truth.surface.distances(rays.points(which)), rays.depth[which] - true,
+                rays.total[which], sigma, confidences(sigma, density.h3(rays.depth[which]))))
+        self.error, self.along, self.likelihood, self.sigma, self.confidence = (
+            np.concatenate(column) for column in zip(*parts))
+
+
+def reconstructed(views: Sequence[View], settings: Settings) -> Reconstruction:
+    """Return the finished reconstruction of the views."""
+    reconstruction = Reconstruction(settings)
+    for view in views:
+        reconstruction.add(view)
+    reconstruction.finish()
+    return reconstruction
+
+
+def accuracy(name: str, of: str, mesh: Geometry, truth: Truth) -> Row:
+    """Return how far a mesh's vertices are from the surface, and how much of it they cover."""
+    error = truth.surface.distances(mesh.vertices)
+    complete = truth.completeness(mesh, NEAR)
+    precise = float(np.mean(error <= NEAR))
+    return {
+        'noise': name, 'of': of, 'vertices': len(error), 'mean': 1e3 * float(error.mean()),
+        'median': 1e3 * float(np.median(error)), 'p95': 1e3 * float(np.percentile(error, 95)),
+        '> 1 mm %': 100 * (1 - precise), 'complete %': 100 * complete,
+        'F %': 200 * precise * complete / (precise + complete)}
+
+
+def best(mesh: Geometry, score: NDArray[Any]) -> Geometry:
+    """Return the share KEPT of a mesh's vertices with the largest scores."""
+    kept = np.zeros(len(score), bool)
+    kept[np.argsort(-score, kind='stable')[:round(KEPT * len(score))]] = True
+    return mesh.only(kept)
+
+
+def confidence(name: str, start: str, found: Found, regime: Regime, least: float) -> tuple[
+        Row, Row]:
+    """Return NAUSE with purity and retention, and the calibration of sigma by tenths."""
+    near = found.error <= max(NEAR, 2 * regime.sigma)
+    kept = found.confidence >= least
+    row = {'noise': name, 'start': start, 'rays': len(near)} | {
+        f'NAUSE {score}': nause(found.error, values) for score, values in (
+            ('likelihood', found.likelihood), ('sigma', -found.sigma),
+            ('confidence', found.confidence))} | {
+        'near %': 100 * float(near.mean()), 'near, of kept %': 100 * float(near[kept].mean()),
+        'kept, of near %': 100 * float(kept[near].mean())}
+    # what lies on another surface is an outlier, of which sigma says nothing
+    counts = np.isfinite(found.sigma) & (np.abs(found.along) < _JUMP * regime.h3)
+    along, sigma = found.along[counts], found.sigma[counts]
+    tenths: Row = {'noise': name, 'start': start, 'counted %': 100 * float(counts.mean())}
+    for n, part in enumerate(np.array_split(np.argsort(sigma, kind='stable'), 10), 1):
+        rms = float(np.sqrt(np.mean(along[part] ** 2)))
+        tenths[f'{10 * n} %'] = rms / float(sigma[part].mean())
+    return row, tenths
+
+
+def edges(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regime) -> Row:
+    """
+    Return how many edges across true jumps the thresholds leave, and how many good ones they cut.
+
+    Edges count whose two vertices are found where their rays truly end.
+    """
+    counts = np.zeros(6, int)
+    for number, keyframe in enumerate(reconstruction.keyframes):
+        camera, rays = keyframe.view.camera, keyframe.rays
+        shape = (camera.height, camera.width)
+        right = np.zeros(shape, bool).reshape(-1)
+        off = np.abs(rays.depth - truth.depth(keyframe.view).reshape(-1)[rays.pixels])
+        right[rays.pixels] = rays.converged & (off < max(NEAR, 2 * regime.sigma))
+        kept = _edge_pixels(reconstruction, number, keyframe)
+        for across, down in ((1, 0), (0, 1), (1, 1)):
+            v, u = np.mgrid[:camera.height - down, :camera.width - across]
+            a = (v * camera.width + u).reshape(-1)
+            b = a + down * camera.width + across
+            both = right[a] & right[b]
+            a, b = a[both], b[both]
+            step, change = truth.steps(keyframe.view, a, across, down)
+            jump = (step > _SMOOTH * change) & (change > _JUMP * regime.h3)
+            good = step <= _SMOOTH * np.maximum(change, regime.h3)
+            stays = np.isin(a * np.int64(rays.table.size) + b, kept)
+            wide = jump & (change > _WIDE * regime.h3)
+            counts += [
+                jump.sum(), (jump & stays).sum(), wide.sum(), (wide & stays).sum(), good.sum(),
+                (good & ~stays).sum()]
+    return {
+        'noise': name, 'across jumps > 4 h3': int(counts[0]), 'left %': _percent(*counts[1::-1]),
+        'across > 20 h3': int(counts[2]), 'left of these %': _percent(*counts[3:1:-1]),
+        'good': int(counts[4]), 'cut %': _percent(*counts[5:3:-1])}
+
+
+def _percent(part: int, whole: int) -> float | None:
+    return 100 * float(part) / float(whole) if whole else None
+
+
+def _edge_pixels(
+    reconstruction: Reconstruction, number: int, keyframe: Keyframe
+) -> NDArray[np.int64]:
+    """Return the edges of a keyframe's mesh as a number for each pair of pixels."""
+    mesh, camera = reconstruction.mesh(number), keyframe.view.camera
+    T = keyframe.view.T_world_camera
+    x, y, z = ((mesh.vertices - T[:3, 3]) @ T[:3, :3]).T
+    u = np.rint(camera.fx * x / z + camera.cx).astype(np.int64)
+    v = np.rint(camera.fy * y / z + camera.cy).astype(np.int64)
+    pixels = v * camera.width + u
+    return pixels[mesh.edges[:, 0]] * keyframe.rays.table.size + pixels[mesh.edges[:, 1]]
+
+
+def starts(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regime) -> Row:
+    """Return what the robust start does to outliers and to other pixels."""
+    outliers = back = others = moved = 0
+    for keyframe in reconstruction.keyframes:
+        true = truth.depth(keyframe.view).reshape(-1)
+        rays = rays_of(reconstruction.density, keyframe.view, 1, 'robust')
+        off = keyframe.view.depth.reshape(-1)[rays.pixels] - true[rays.pixels]
+        after = rays.start - true[rays.pixels]
+        far = np.abs(off) > 5 * max(regime.sigma, NEAR)
+        outliers += int(far.sum())
+        close = max(NEAR, 2 * regime.sigma)
+        found = np.full(len(true), np.nan)
+        found[keyframe.rays.pixels] = np.where(
+            keyframe.rays.converged, keyframe.rays.depth, np.nan)
+        ended = np.abs(found[rays.pixels] - true[rays.pixels])
+        back += int((far & (ended < close)).sum())
+        inlier = np.abs(off) < 3 * max(regime.sigma, NEAR)
+        others += int(inlier.sum())
+        moved += int((inlier & (np.abs(after) > 5 * max(regime.sigma, NEAR))).sum())
+    return {
+        'noise': name, 'outliers': outliers,
+        'brought back %': _percent(back, outliers),
+        'inliers': others, 'moved %': _percent(moved, others)}
+
+
+def tsdf_mesh(views: Sequence[View], settings: Settings) -> tsdf.Mesh:
+    """Return Open3D's TSDF of the same images."""
+    grid = tsdf.Tsdf(settings.voxel_size, settings.depth_max)
+    for view in views:
+        grid.integrate(tsdf.Frame(view))
+    return grid.mesh(TSDF_WEIGHT)
+
+
+def main() -> None:
+    """Measure, print tables, write JSON where asked."""
+    parser = argparse.ArgumentParser(description=__doc__.split('\n\n')[0])
+    parser.add_argument('mesh', type=Path, help='the true surface, metres')
+    parser.add_argument('--exact', action='store_true', help='also the exact density')
+    parser.add_argument('--only', nargs='+', choices=REGIMES, default=list(REGIMES))
+    parser.add_argument('--seed', type=int, default=0, help='of the noise (0)')
+    parser.add_argument('--json', metavar='FILE', help='also write the figures there')
+    arguments = parser.parse_args()
+    mesh = load_mesh(arguments.mesh)
+    about = machine()
+    print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, load '
+          f'{about["load"]:.1f}')
+    if not tsdf.INSTALLED:
+        print('Open3D is not installed: no TSDF')
+    tables: dict[str, list[Row]] = {title: [] for title in (
+        'distance to the truth, mm', 'scores', 'rms error / mean sigma, tenths by sigma', 'edges',
+        'starts')}
+    distances, scores, tenths, cut, begun = tables.values()
+    for name in arguments.only:
+        regime = REGIMES[name]
+        views = regime.views(mesh, arguments.seed)
+        truth = Truth(mesh, views)
+        for density in ('voxel', 'exact') if arguments.exact else ('voxel',):
+            settings = regime.settings(density=density)
+            warm_up(settings)
+            with closing(reconstructed(views, settings)) as reconstruction:
+                meshes = [one for _, one in reconstruction.meshes()]
+                whole = Geometry.of(meshes)
+                score = np.concatenate([one.vertex_confidence for one in meshes])
+                distances += [
+                    accuracy(name, density, whole, truth),
+                    accuracy(name, f'{density}, best', best(whole, score), truth)]
+                if density == 'exact':
+                    continue
+                row, tenth = confidence(
+                    name, 'robust', Found(reconstruction, truth), regime, settings.min_confidence)
+                scores.append(row)
+                tenths.append(tenth)
+                cut.append(edges(name, reconstruction, truth, regime))
+                begun.append(starts(name, reconstruction, truth, regime))
+        with closing(reconstructed(
+                views, regime.settings(start='observed'))) as reconstruction:
+            row, tenth = confidence(
+                name, 'observed', Found(reconstruction, truth), regime, settings.min_confidence)
+            scores.append(row)
+            tenths.append(tenth)
+        if tsdf.INSTALLED:
+            other = tsdf_mesh(views, settings)
+            whole = Geometry(other.vertices, other.faces)
+            rows = [
+                accuracy(name, 'TSDF', whole, truth),
+                accuracy(name, 'TSDF, best', best(whole, other.weight), truth)]
+            for row in distances[-2:]:
+                ours = row['mean'] / rows[row['of'].endswith('best')]['mean']
+                row['/ TSDF'] = ours
+            distances += [row | {'/ TSDF': None} for row in rows]
+    for title, rows in tables.items():
+        table(title, rows)
+    if arguments.json:
+        with open(arguments.json, 'w', encoding='utf-8') as file:
+            json.dump({'machine': about} | tables, file, indent=1)
+
+
+if __name__ == '__main__':
+    main()
