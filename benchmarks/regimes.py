@@ -50,19 +50,21 @@ class Regime:
 
     :param noise: of the sensor
     :param distance: of the cameras, metres
-    :param h3: bandwidth along the depth and voxel size, metres
+    :param h3: bandwidth along the depth, metres
     :param sigma: the noise's standard deviation along the depth, metres
+    :param voxel_size: metres
     """
 
     noise: Noise | None
     distance: float
     h3: float
     sigma: float
+    voxel_size: float
 
     def settings(self, **changes: Any) -> Settings:
         """Return settings with which every view owns a mesh; the rest at its default."""
         return Settings(
-            depth_bandwidth=self.h3, depth_bandwidth_quadratic=0.0, voxel_size=self.h3,
+            depth_bandwidth=self.h3, depth_bandwidth_quadratic=0.0, voxel_size=self.voxel_size,
             keyframe_translation=0.0, remarch_budget=0.0).updated(changes)
 
     def views(self, mesh: trimesh.Trimesh, seed: int) -> list[View]:
@@ -71,12 +73,13 @@ class Regime:
 
 
 REGIMES = {
-    'none': Regime(None, 0.35, 0.001, 0.0),
-    '1 mm': Regime(Noise('gaussian', 0.001), 0.35, 0.001, 0.001),
-    '2 mm': Regime(Noise('gaussian', 0.002), 0.35, 0.002, 0.002),
-    '1 mm, 5 % outliers': Regime(Noise('gaussian', 0.001, 0.05), 0.35, 0.001, 0.001),
-    'kinect, 0.8 m': Regime(Noise('kinect'), 0.8, 0.0015, 0.0015),
-    'kinect, 1.5 m': Regime(Noise('kinect'), 1.5, 0.0035, 0.0035),
+    'none': Regime(None, 0.35, 0.001, 0.0, 0.001),
+    '1 mm': Regime(Noise('gaussian', 0.001), 0.35, 0.001, 0.001, 0.001),
+    '2 mm': Regime(Noise('gaussian', 0.002), 0.35, 0.002, 0.002, 0.002),
+    '2 mm, voxel 1 mm': Regime(Noise('gaussian', 0.002), 0.35, 0.002, 0.002, 0.001),
+    '1 mm, 5 % outliers': Regime(Noise('gaussian', 0.001, 0.05), 0.35, 0.001, 0.001, 0.001),
+    'kinect, 0.8 m': Regime(Noise('kinect'), 0.8, 0.0015, 0.0015, 0.0015),
+    'kinect, 1.5 m': Regime(Noise('kinect'), 1.5, 0.0035, 0.0035, 0.0035),
 }
 Row = dict[str, Any]
 
