@@ -69,7 +69,8 @@ class Rays:
     def copy(self) -> Rays:
         """Return rays with results of their own."""
         return replace(
-            self, depth=self.depth.copy(), total=self.total.copy(), status=self.status.copy(),
+            self, depth=self.depth.copy(), total=self.total.copy(),
+            curvature=self.curvature.copy(), status=self.status.copy(),
             iterations=self.iterations.copy(), marched=self.marched.copy())
 
     @property
