@@ -263,6 +263,7 @@ def main() -> None:
         regime = REGIMES[name]
         views = regime.views(mesh, arguments.seed)
         truth = Truth(mesh, views)
+        ours: list[Row] = []
         for density in ('voxel', 'exact') if arguments.exact else ('voxel',):
             settings = regime.settings(density=density)
             warm_up(settings)
@@ -270,7 +271,7 @@ def main() -> None:
                 meshes = [one for _, one in reconstruction.meshes()]
                 whole = Geometry.of(meshes)
                 score = np.concatenate([one.vertex_confidence for one in meshes])
-                distances += [
+                ours += [
                     accuracy(name, density, whole, truth),
                     accuracy(name, f'{density}, best', best(whole, score), truth)]
                 if density == 'exact':
@@ -293,10 +294,10 @@ def main() -> None:
             rows = [
                 accuracy(name, 'TSDF', whole, truth),
                 accuracy(name, 'TSDF, best', best(whole, other.weight), truth)]
-            for row in distances[-2:]:
-                ours = row['mean'] / rows[row['of'].endswith('best')]['mean']
-                row['/ TSDF'] = ours
-            distances += [row | {'/ TSDF': None} for row in rows]
+            for row in ours:
+                row['/ TSDF'] = row['mean'] / rows[row['of'].endswith('best')]['mean']
+            ours += [row | {'/ TSDF': None} for row in rows]
+        distances += ours
     for title, rows in tables.items():
         table(title, rows)
     if arguments.json:
