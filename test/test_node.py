@@ -13,7 +13,7 @@ import pytest
 
 from gr2t_ros.core.view import View
 from gr2t_ros.io.ply import read
-from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
+from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, OPTICAL_FRAME, record
 
 rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
@@ -65,6 +65,10 @@ def test_map_from_a_played_bag(
         arrays = observer.collect(MarkerArray, '/gr2t/mesh', outputs_profile(10))
         clouds = observer.collect(PointCloud2, '/gr2t/points', outputs_profile(10))
         states = observer.collect(DiagnosticArray, '/diagnostics', QoSProfile(depth=10))
+        images = [
+            observer.collect(kind, f'/gr2t/{topic}', outputs_profile(10)) for kind, topic in (
+                (Image, 'depth/image'), (CameraInfo, 'depth/camera_info'),
+                (Image, 'likelihood/image'))]
         assert not observer.call(Trigger, 'save_snapshot').success
 
         isolation.play(bag)
@@ -76,6 +80,11 @@ def test_map_from_a_played_bag(
 
         assert 'the map begins, in the frame map' in node.log
         _check_cloud(deserialize_message(clouds[-1], PointCloud2))
+        observer.spin_until(lambda: all(images), 'the images')
+        _check_images(*(
+            deserialize_message(messages[0], kind)
+            for kind, messages in zip((Image, CameraInfo, Image), images)))
+
         def reported() -> bool:
             """Tell whether the newest status knows the last image."""
             array = deserialize_message(states[-1], DiagnosticArray) if states else None
@@ -161,6 +170,25 @@ def _check_cloud(cloud: PointCloud2) -> None:
     assert len(points) == cloud.width * cloud.height > 100
     assert np.abs(points[:, 2]).max() < FLAT
     assert (points[:, 4] > 0).all()
+
+
+def _check_images(depth: Image, info: CameraInfo, likelihood: Image) -> None:
+    assert depth.header == info.header == likelihood.header
+    assert depth.header.frame_id == OPTICAL_FRAME
+    stamp_ns = Time.from_msg(depth.header.stamp).nanoseconds
+    view, = (view for view in plane_views(FRAMES) if view.stamp_ns == stamp_ns)
+    assert (info.width, info.height) == (view.camera.width, view.camera.height)
+    z, likely = (
+        np.frombuffer(item.data, np.float32).reshape(info.height, info.width)
+        for item in (depth, likelihood))
+    found = np.isfinite(z)
+    assert found.mean() > 0.9
+    assert (likely[found] > 0).all() and np.isnan(likely[~found]).all()
+    fx, _, cx, _, fy, cy, *_ = info.k
+    v, u = np.nonzero(found)
+    points = np.column_stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(u))]) * z[found][:, None]
+    height = points @ view.T_world_camera[2, :3] + view.T_world_camera[2, 3]
+    assert np.abs(height).max() < FLAT
 
 
 @pytest.mark.parametrize('number', [signal.SIGINT, signal.SIGTERM])

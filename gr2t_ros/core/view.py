@@ -21,6 +21,7 @@ class View:
     :param T_world_camera: (4, 4) float64, camera (optical frame) to world, metres
     :param stamp_ns: acquisition time, nanoseconds
     :param camera_name: which camera it is of, where there are several
+    :param frame_id: of the camera (optical frame)
     """
 
     depth: NDArray[np.float32]
@@ -28,3 +29,4 @@ class View:
     T_world_camera: NDArray[np.float64]
     stamp_ns: int
     camera_name: str = ''
+    frame_id: str = ''

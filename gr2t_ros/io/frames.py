@@ -255,7 +255,7 @@ class FrameAssembler:
         depth = self._unmasked(image)
         self._newest_ns = max(self._newest_ns, image.stamp_ns)
         return View(
-            depth, camera, np.array(T_world_camera), stamp_ns, self._name)
+            depth, camera, np.array(T_world_camera), stamp_ns, self._name, frame)
 
     def _unmasked(self, image: _Image) -> NDArray[np.float32]:
         """Make the depths that the mask hides invalid."""

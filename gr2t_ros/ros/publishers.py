@@ -1,6 +1,6 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What the node publishes of the map: markers and a point cloud."""
+"""What the node publishes of the map: markers, a point cloud and images."""
 from __future__ import annotations
 
 from array import array
@@ -21,6 +21,7 @@ from ..core.reconstruction import Reconstruction
 from ..core.view_mesh import ViewMesh
 from ..io.cdr import Marker, marker_array, no_markers
 from ..settings import Settings
+from .images import ImagePublishers
 from .timings import Timings
 
 NAMESPACE, EDGES = 'mesh', 'edges'
@@ -38,7 +39,7 @@ _POINT = np.dtype([
 
 class MapPublishers:
     """
-    The topics ~/mesh, ~/edges and ~/points.
+    The topics ~/mesh, ~/edges, ~/points, and those of ImagePublishers.
 
     One TRIANGLE_LIST for each keyframe; one LINE_LIST for each, every edge in its own likelihood's
     colour; the vertices of all of them.
@@ -59,6 +60,7 @@ class MapPublishers:
         self._mesh = node.create_publisher(MarkerArray, '~/mesh', outputs_profile(5))
         self._points = node.create_publisher(PointCloud2, '~/points', outputs_profile(1))
         self._edges = node.create_publisher(MarkerArray, '~/edges', outputs_profile(5))
+        self._images = ImagePublishers(node, outputs_profile(1), self._timings)
         self._listeners = {self._mesh: 0, self._points: 0, self._edges: 0}
         self._waiting: dict[int, None] = {}  # keyframes, in order
         self._clouds: dict[int, NDArray[np.void]] = {}  # of each keyframe; see cloud
@@ -70,7 +72,9 @@ class MapPublishers:
 
     def change(self, keyframes: Iterable[int]) -> None:
         """Note keyframes whose meshes changed."""
-        self._waiting.update(dict.fromkeys(keyframes))
+        changed = dict.fromkeys(keyframes)
+        self._waiting.update(changed)
+        self._images.change(changed)
 
     def publish(
         self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
@@ -82,20 +86,21 @@ class MapPublishers:
         :param stamp_ns: of the newest image in the map
         :param views: in the map
         """
-        everything = range(len(reconstruction.keyframes))
+        sent = self._images.publish(reconstruction)
+        everything = dict.fromkeys(range(len(reconstruction.keyframes)))
         appeared = [self._appeared(publisher) for publisher in self._listeners]
         if any(appeared):
-            self.change(everything)
+            self._waiting.update(everything)
         if not any(self._listeners.values()):
             self._clouds.clear()
-            return False
+            return sent
         if not self._waiting:
-            return False
+            return sent
         scale = reconstruction.colour_scale()
         # likelihoods are shares of the number of views; what they are shares of is compared
         if abs(views * scale - self._scale) > _NEW_COLOURS * self._scale:
             self._scale = views * scale
-            self.change(everything)
+            self._waiting.update(everything)
         with self._timings.measure('mesh'):
             meshes = self._take(reconstruction)
         with self._timings.measure('publish', cpu=True):
