@@ -25,6 +25,7 @@ from .camera import Camera
 from .exact_density import ExactDensity
 from .frozen import frozen, Room
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
+from .shading import triangle_corners
 from .view import View
 from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
 from .voxel_density import VoxelDensity
@@ -353,8 +354,9 @@ def warm_up(settings: Settings) -> float:
     for stamp in range(2):
         tiny.add(View(depth, camera, np.eye(4), stamp))
     tiny.finish()
-    for _ in tiny.meshes():
-        pass
+    for _, mesh in tiny.meshes():
+        triangle_corners(
+            mesh.vertices, mesh.faces, np.zeros(mesh.vertices.shape, np.uint8), shading=True)
     tiny.close()
     with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
     return perf_counter() - began

@@ -18,6 +18,7 @@ from visualization_msgs.msg import MarkerArray
 
 from ..core.colour import colours
 from ..core.reconstruction import Reconstruction
+from ..core.shading import triangle_corners
 from ..core.view_mesh import ViewMesh
 from ..io.cdr import Marker, marker_array, no_markers
 from ..settings import Settings
@@ -29,8 +30,6 @@ MAX_POINTS = 2_000_000
 _MAX_CORNERS = 400_000  # in one message: 16 MB; what is over goes with the next
 _MAX_SECONDS = 0.25  # for making one message
 _LINE = 0.1  # width of a line, of the median edge
-_LIGHT = np.array([0.36, 0.48, 0.8])  # towards it, in the world: shared faces of views look alike
-_DARKEST = 0.45  # what a face turned away from the light keeps of its colour
 _NEW_COLOURS = 0.2  # change of the colour scale with which all meshes are sent again
 _POINT = np.dtype([
     ('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('rgb', '<u4'), ('likelihood', '<f4'),
@@ -174,21 +173,8 @@ def triangles(
     :param shading: whether faces turned away from a light of the world are darker: viewers do not
         light what has colours of its own, and without it no shape is seen
     """
-    corners = mesh.faces.reshape(-1)
-    points = mesh.vertices[corners]
-    colour = colours(mesh.vertex_likelihood, scale, colour_map)[corners]
-    if shading:
-        colour = (colour * np.repeat(_brightness(points), 3)[:, None]).astype(np.uint8)
-    return Marker(marker, points, colour)
-
-
-def _brightness(corners: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return Lambert's factor of each face, from _DARKEST to 1."""
-    a, b, c = corners.reshape(-1, 3, 3).astype(np.float32).transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    length = np.maximum(np.sqrt(np.einsum('ij,ij->i', normal, normal)), np.float32(1e-20))
-    cosine = normal @ _LIGHT.astype(np.float32) / length
-    return np.float32(_DARKEST) + np.float32((1 - _DARKEST) / 2) * (1 + np.clip(cosine, -1, 1))
+    colour = colours(mesh.vertex_likelihood, scale, colour_map)
+    return Marker(marker, *triangle_corners(mesh.vertices, mesh.faces, colour, shading))
 
 
 def lines(marker: int, mesh: ViewMesh, scale: float, colour_map: str) -> Marker:
