@@ -17,7 +17,20 @@ from numpy.typing import NDArray
 
 from gr2t_ros.core.view import View
 
-INSTALLED = find_spec('open3d') is not None
+
+def _importable() -> bool:
+    """Tell whether Open3D can be used; where it is installed but cannot be, print why."""
+    if find_spec('open3d') is None:
+        return False
+    try:
+        import_module('open3d')
+    except ImportError as error:
+        print(f'Open3D is installed, but cannot be imported: {error}')
+        return False
+    return True
+
+
+INSTALLED = _importable()
 _TRUNCATION = 4.0  # voxels
 _SEEN = 0.5  # weight; below that of one frame
 _BLOCKS = 40000  # at the start; it grows
