@@ -17,6 +17,9 @@ from ..settings import Settings
 from .timings import Timings
 
 MAX_MESSAGES = 20_000  # other than images that may wait: 20 s of a 1 kHz tf
+_QUEUE_FULL = (
+    'images come faster than they can be integrated, and the oldest are left out: raise '
+    'ray_stride or lower the frame rate')
 
 
 @dataclass
@@ -38,6 +41,14 @@ class CameraIntake:
     def dropped(self) -> Counter[str]:
         """Return the number of images that were not used, by reason."""
         return Counter(dict(self.lost)) + Counter(dict(self.assembler.dropped))
+
+    @property
+    def explanations(self) -> dict[str, str]:
+        """Return a sentence for each reason for which something was left out."""
+        explanations = dict(self.assembler.explanations)
+        if self.lost['queue_full']:
+            explanations['queue_full'] = _QUEUE_FULL
+        return explanations
 
     @property
     def waiting(self) -> int:
@@ -183,22 +194,20 @@ class Intake:
                 self._timings.add('queue and pose', camera.assembler.waits.pop(0))
         return views
 
-    def news(self) -> list[tuple[str, str]]:
-        """Return reasons for which something was left out, with a sentence, each once."""
+    def news(self) -> list[str]:
+        """Return sentences on what was left out or noticed, each reason's once."""
         found = [('', reason, sentence)
                  for reason, sentence in self.world.explanations.items()]
         for name, camera in self.cameras.items():
             found += [(name, reason, sentence)
-                      for reason, sentence in camera.assembler.explanations.items()]
-            if camera.lost['queue_full']:
-                found.append((name, 'queue_full', (
-                    'images come faster than they can be integrated, and the oldest are left out: '
-                    'raise ray_stride or lower the frame rate')))
+                      for reason, sentence in camera.explanations.items()]
         news = []
         for name, reason, sentence in found:
             if (name, reason) not in self._told:
                 self._told.add((name, reason))
-                news.append((reason, f'camera {name}: {sentence}' if name else sentence))
+                counted = name in self.cameras and reason in self.cameras[name].dropped
+                line = f'{sentence} [{reason}: said once{", then counted" if counted else ""}]'
+                news.append(f'camera {name}: {line}' if name else line)
         return news
 
     def _feed(self, camera: CameraIntake, message: Any, received_ns: int) -> None:

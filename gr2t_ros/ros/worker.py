@@ -233,8 +233,8 @@ class Worker:
 
     def _take(self) -> None:
         self._views.extend(self.intake.take())
-        for reason, sentence in self.intake.news():
-            self._log.warning(f'{sentence} [{reason}: said once, then counted]')
+        for sentence in self.intake.news():
+            self._log.warning(sentence)
 
     def _time_jumped(self, stamp_ns: int) -> None:
         emptied = self._settings.reset_on_time_jump
@@ -254,6 +254,7 @@ class Worker:
             return
         except Exception as error:  # costs this frame, not the others
             self.intake.drop(view, 'error')
+            self.explanations['error'] = 'a frame failed: the log says where'
             self._fail(f'the frame of {view.stamp_ns * 1e-9:.3f} s', error)
             return
         self.intake.cameras[view.camera_name].integrated += 1
