@@ -146,7 +146,7 @@ def _theirs(peer: tsdf.Tsdf, view: View, with_mesh: bool) -> Clock:
     clock('Open3D integrate', peer.integrate, frame)
     clock('Open3D ray cast', peer.ray_cast, frame)
     if with_mesh:
-        clock('Open3D mesh', peer.vertices)
+        clock('Open3D mesh', peer.mesh)
     return clock
 
 

@@ -29,7 +29,7 @@ Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Density = ExactDensity | VoxelDensity
 
-_CHUNK = 2048  # rays a task
+_CHUNK = 8192  # rays a task
 
 
 @dataclass(eq=False)

@@ -30,7 +30,7 @@ from .view import View
 from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
 from .voxel_density import VoxelDensity
 
-_SLICE = 16384  # rays marched between two looks at the clock
+_SLICE = 65536  # rays marched between two looks at the clock
 _ALIASED = 0.05  # share of pixels too near for the voxel size that is worth a notice
 
 

@@ -35,9 +35,9 @@ from .warped import (
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
-_ROWS_OF_CELLS = 15  # a task
-_BLOCKS = 64  # a task
-_POINTS = 4096  # a task
+_ROWS_OF_CELLS = 30  # a task
+_BLOCKS = 128  # a task
+_POINTS = 16384  # a task
 _FINEST = 1.5  # voxels wider than this many lateral bandwidths alias
 
 
@@ -185,7 +185,8 @@ class VoxelDensity:
     def image_of(self, view: View) -> Warped:
         """Return a view's depth image in units of its bandwidth."""
         if self._recent is None or self._recent[0] is not view:
-            self._recent = (view, warped(view, self.scale, self.weights))
+            before = self._recent[1] if self._recent else None
+            self._recent = (view, warped(view, self.scale, self.weights, before))
         return self._recent[1]
 
     def _check_reach(self, view: View) -> None:

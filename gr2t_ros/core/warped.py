@@ -143,11 +143,21 @@ class Support(NamedTuple):
     columns: int
 
 
-def warped(view: View, scale: Scale, weights: Weights) -> Warped:
-    """Return a view's depth image in units of its bandwidth."""
+def warped(
+    view: View, scale: Scale, weights: Weights, reuse: Warped | None = None
+) -> Warped:
+    """
+    Return a view's depth image in units of its bandwidth.
+
+    :param reuse: an image that is no longer needed; where it is as large this one takes its place
+    """
     height, width = view.depth.shape
     pad = 2 * weights.lanes + CELL
-    image = np.full((height + 2 * pad, width + 2 * pad), INVALID)
+    whole = (height + 2 * pad, width + 2 * pad)
+    if reuse is not None and reuse.stride == whole[1] and reuse.image.size == whole[0] * whole[1]:
+        image = reuse.image.reshape(whole)
+    else:
+        image = np.full(whole, INVALID)
     shape = (-(-height // CELL), -(-width // CELL))
     low, high = np.full(shape, 2 ** 30, np.int32), np.full(shape, -1, np.int32)
     # without a ray a pixel has no place in space
@@ -169,6 +179,7 @@ def _warp(
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             at = depth[v, u] * per_metre
+            image[v + pad, u + pad] = INVALID
             if np.float32(0) < at <= last:
                 i = int(at)
                 t = table[i] + (at - np.float32(i)) * (table[i + 1] - table[i])
@@ -205,6 +216,13 @@ def find_support(
         np.zeros(columns, np.int32), np.zeros(columns, np.int32))
 
 
+@njit(inline='always')
+def _bits(first: int, last: int, shift: int) -> np.uint64:
+    """Return a mask of the bins from first to last, of 2^shift each."""
+    a, b = uint64(first >> shift), uint64(last >> shift)
+    return ((uint64(2) << (b - a)) - uint64(1)) << a
+
+
 @uncounted()
 def _find_support(
     warped_image: Warped, height: int, width: int, lanes: int, support: Support, first: int,
@@ -217,8 +235,7 @@ def _find_support(
     """
     image, stride, pad = warped_image.image, warped_image.stride, warped_image.pad
     rows, columns = warped_image.low.shape
-    margin = lanes // 2
-    about = -(-margin // CELL)
+    about = -(-lanes // (2 * CELL))
     reach = int(np.ceil(SUPPORT * BINS))
     for j in range(first, end):
         low_of[:] = 2 ** 30
@@ -245,14 +262,21 @@ def _find_support(
                 # one surface: no gap that a bin would show
                 mask = (uint64(2) << uint64(span >> shift)) - uint64(1)
             else:
-                for v in range(max(CELL * j - margin, 0), min(CELL * (j + 1) + margin, height)):
-                    for u in range(max(CELL * i - margin, 0), min(CELL * (i + 1) + margin, width)):
-                        t = image[(v + pad) * stride + u + pad]
-                        if t != INVALID:
-                            bin_ = int(t * _UNWARP)
-                            a = uint64((bin_ - reach - base) >> shift)
-                            c = uint64((bin_ + reach - base) >> shift)
-                            mask |= ((uint64(2) << (c - a)) - uint64(1)) << a
+                for row in range(max(j - about, 0), min(j + about + 1, rows)):
+                    for column in range(max(i - about, 0), min(i + about + 1, columns)):
+                        low = warped_image.low[row, column]
+                        high = warped_image.high[row, column]
+                        if high < 0:
+                            continue
+                        if high - low <= 2 * reach:
+                            mask |= _bits(low - reach - base, high + reach - base, shift)
+                            continue
+                        for v in range(CELL * row, min(CELL * (row + 1), height)):
+                            for u in range(CELL * column, min(CELL * (column + 1), width)):
+                                t = image[(v + pad) * stride + u + pad]
+                                if t != INVALID:
+                                    low = int(t * _UNWARP) - reach - base
+                                    mask |= _bits(low, low + 2 * reach, shift)
             support.base[cell] = base
             support.shift[cell] = shift
             support.mask[cell] = mask
