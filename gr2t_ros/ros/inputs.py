@@ -140,10 +140,12 @@ class Input:
         return 'nobody publishes it'
 
     def candidates(self) -> list[str]:
-        """Return other topics of its type that are published, the most similar first."""
+        """Return topics of its type that other nodes publish, the most similar first."""
+        own = {name for name, _ in self._node.get_publisher_names_and_types_by_node(
+            self._node.get_name(), self._node.get_namespace())}
         names = [
             name for name, types in self._node.get_topic_names_and_types()
-            if self.type_name in types and name != self.topic
+            if self.type_name in types and name not in {self.topic, *own}
             and self._node.count_publishers(name)]
         return sorted(names, key=lambda name: -difflib.SequenceMatcher(
             None, self.topic, name, autojunk=False).ratio())[:_CANDIDATES]
