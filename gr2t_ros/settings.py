@@ -94,8 +94,9 @@ class Settings:
         1000, 'Keyframes kept; later ones still add to the density (reported).',
         low=1, high=1_000_000, live=True)
     remarch_budget: float = _parameter(
-        0.02, 'Time per frame for marching older rays again; what is left waits, and is done '
-        'before a snapshot or at the end.', unit='s', low=0.0, high=60.0, live=True)
+        0.02, 'Time per frame for marching older rays again, less while images wait in the '
+        'node\'s queue; what is left is done when there is time, before a snapshot or at the end.',
+        unit='s', low=0.0, high=60.0, live=True)
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
 

@@ -1,6 +1,8 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """The engine keeps its promises: incremental is batch, threads change nothing, bounds are said."""
+from contextlib import closing
+
 import numpy as np
 import pytest
 from scenes_for_tests import bumpy_views, looking_at_origin, plane_view, pose, sphere_view
@@ -65,6 +67,18 @@ def test_what_appears_beside_a_surface_is_seen_by_its_rays(settings):
         np.testing.assert_array_equal(a, b)
     assert updates[1].remarched == 1200 and updates[1].changed == (1, 0)
     assert updates[2].remarched == 0 and updates[2].changed == (2,)
+
+
+def test_under_load_older_rays_wait_and_none_is_forgotten():
+    with (closing(Reconstruction(SETTINGS.updated({'remarch_budget': 60.0}))) as busy,
+          closing(Reconstruction(SETTINGS.updated({'remarch_budget': 60.0}))) as idle):
+        for view in orbit(4):
+            loaded, free = busy.add(view, load=1.0), idle.add(view)
+            assert loaded.remarched == 0 and loaded.marched == free.marched
+        assert loaded.waiting > free.waiting == 0
+        busy.finish()
+        for a, b in zip(rays_of(busy), rays_of(idle)):
+            np.testing.assert_array_equal(a, b)
 
 
 @pytest.mark.parametrize('settings', [SETTINGS, EXACT], ids=['voxel', 'exact'])

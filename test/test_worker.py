@@ -170,10 +170,10 @@ def test_one_frame_that_fails_costs_itself_only(
 ) -> None:
     add = Reconstruction.add
 
-    def fails_once(self: Reconstruction, view: View) -> Update:
+    def fails_once(self: Reconstruction, view: View, load: float) -> Update:
         if view.stamp_ns == 1_700_000_000_200_000_000:
             raise ZeroDivisionError('a defect')
-        return add(self, view)
+        return add(self, view, load)
 
     monkeypatch.setattr(Reconstruction, 'add', fails_once)
     rig = make()
@@ -212,10 +212,10 @@ def test_reset_and_pause_do_not_wait_for_a_frame(
     """What waits when a reset comes is not part of the new map."""
     add, go, busy = Reconstruction.add, threading.Event(), threading.Event()
 
-    def slow(self: Reconstruction, view: View) -> Update:
+    def slow(self: Reconstruction, view: View, load: float) -> Update:
         busy.set()
         assert go.wait(LIMIT)
-        return add(self, view)
+        return add(self, view, load)
 
     monkeypatch.setattr(Reconstruction, 'add', slow)
     rig = make()

@@ -122,13 +122,14 @@ class Reconstruction:
         lattice = self._density
         return lattice.depth_max if isinstance(lattice, VoxelDensity) else float('inf')
 
-    def add(self, view: View) -> Update:
+    def add(self, view: View, load: float = 0.0) -> Update:
         """
         Add a view's kernels to the density and march what they change.
 
         A new keyframe's rays are marched at once, older rays within `remarch_budget`; what is left
         waits for the next view or for finish.
 
+        :param load: 0 to 1; this share of the budget is left out, as other views wait
         :raises FrameError: if the depth image is not of its camera's size
         """
         if view.depth.shape != (view.camera.height, view.camera.width):
@@ -152,7 +153,8 @@ class Reconstruction:
                 'keyframes', f'max_keyframes {self.settings.max_keyframes} is reached: later '
                 'views add to the density, but own no mesh')
         integrated = perf_counter()
-        update = self._march(number, integrated + self.settings.remarch_budget)
+        update = self._march(
+            number, integrated + (1.0 - load) * self.settings.remarch_budget)
         return replace(
             update, keyframe=number, notices=tuple(notices),
             seconds={'integrate': integrated - began, 'march': perf_counter() - integrated})

@@ -166,6 +166,11 @@ class Intake:
             self._messages = deque(item for item in self._messages if item[1] is None)
 
     @property
+    def load(self) -> float:
+        """Return how full the fullest camera's queue of images is, 0 to 1."""
+        return max(camera.queued for camera in self.cameras.values()) / self._queue_size
+
+    @property
     def queued(self) -> int:
         """Return the number of messages that wait."""
         return len(self._messages)

@@ -247,7 +247,7 @@ class Worker:
 
     def _integrate(self, view: View) -> None:
         try:
-            update = self._reconstruction.add(view)
+            update = self._reconstruction.add(view, self.intake.load)
         except FrameError as error:
             self.intake.drop(view, error.reason)
             self._tell(error.reason, str(error))
