@@ -2,23 +2,25 @@
 # make test      lint, type check, all tests
 # make test-ros  the tests of what uses ROS: what another DISTRO needs
 # make bench     what a frame costs, beside Open3D; docs/performance.md explains it
+# make paper     the paper's experiment again, beside Open3D; docs/results.md explains it
 # make venv      only what these begin with: the environment they run in
 #
 # Options: DISTRO=jazzy (wheels; default kilted), PYTHON=python3.12, ARGS='-k camera' for pytest or
-# ARGS=--quick for the benchmark, EXTRAS. Where ROS 2 is sourced it is used, and DISTRO has no
-# effect.
+# ARGS=--quick for the benchmark, MESH=bunny.ply for the paper, EXTRAS. Where ROS 2 is sourced it is
+# used, and DISTRO has no effect.
 
 PYTHON =
 DISTRO = kilted
 EXTRAS = dev,simulation
 ARGS =
+MESH = ../shared/data/meshes/bunny_metric_watertight.ply
 VENV = $(if $(filter kilted,$(DISTRO)),.venv,.venv-$(DISTRO))
 RUN = $(VENV)/bin/python
 # Type hints differ between releases of numpy: those pinned for Python 3.11 are what counts.
 OTHER_HINTS = [ -n "$(ROS_DISTRO)" ] || \
     ! $(RUN) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 
-.PHONY: venv demo test test-ros bench clean
+.PHONY: venv demo test test-ros bench paper clean
 
 venv:
 	@$(or $(PYTHON),python3) scripts/setup_venv.py --venv $(VENV) --distro $(DISTRO) \
@@ -35,9 +37,12 @@ test: venv
 test-ros: venv
 	$(RUN) -m pytest $$(grep -l rclpy test/test_*.py) $(ARGS)
 
-bench: EXTRAS = dev,simulation,peers
+bench paper: EXTRAS = dev,simulation,peers
 bench: venv
 	$(RUN) benchmarks/streaming.py $(ARGS)
+
+paper: venv
+	$(RUN) benchmarks/paper.py $(MESH) $(ARGS)
 
 clean:
 	rm -rf .venv .venv-jazzy build install log gr2t_ros.egg-info

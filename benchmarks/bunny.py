@@ -54,9 +54,9 @@ def reconstructed(views: Sequence[View], density: str) -> Reconstruction:
     return reconstruction
 
 
-def distances_mm(surface: Surface, points: NDArray[np.float64]) -> dict[str, float]:
-    """Return statistics of the distances from points to the true surface."""
-    d = 1e3 * surface.distances(points)
+def distances_mm(distances: NDArray[np.float64]) -> dict[str, float]:
+    """Return statistics of distances (metres) to the true surface."""
+    d = 1e3 * distances
     return {
         'mean': float(d.mean()), 'median': float(np.median(d)), 'p95': float(np.quantile(d, 0.95)),
         'vertices': len(d)}
@@ -114,14 +114,14 @@ def main() -> None:
             with closing(reconstructed(views, density)) as reconstruction:
                 vertices = np.concatenate([m.vertices for _, m in reconstruction.meshes()])
                 distances.append({'images': case, 'density': density} | distances_mm(
-                    surface, vertices))
+                    surface.distances(vertices)))
                 if case == next(iter(CASES)):
                     costs += [
                         {'density': density, 'threads': threads} | ray_cost(
                             reconstruction, threads) for threads in (1, 2)]
         if tsdf.INSTALLED:
             distances.append({'images': case, 'density': 'TSDF'} | distances_mm(
-                surface, tsdf_vertices(views)))
+                surface.distances(tsdf_vertices(views))))
     for cost in costs:
         cost['x the paper'] = PAPER_SECONDS / (1e-6 * (cost['start us'] + cost['march us']))
     table('distance to the truth, mm', distances)
