@@ -39,7 +39,7 @@ KEPT = 0.7365  # share of the vertices that Grogan & Dahyot (2014) keep
 NEAR = 0.001  # metres
 TSDF_WEIGHT = 2.5  # three views
 _JUMP = 4.0  # h3; smaller steps are no depth discontinuity to the method
-_WIDE = 20.0  # h3
+_GAPS = (_JUMP, 8.0, 20.0, np.inf)  # h3
 _SMOOTH = 0.5  # of the whole change; a larger part of it in one eighth of a pixel is a jump
 
 
@@ -162,14 +162,17 @@ def edges(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regim
 
     Edges count whose two vertices are found where their rays truly end.
     """
-    counts = np.zeros(6, int)
+    jumps, left = np.zeros(len(_GAPS) - 1, int), np.zeros(len(_GAPS) - 1, int)
+    good_ones = cut = cut_with_vertex = 0
     for number, keyframe in enumerate(reconstruction.keyframes):
         camera, rays = keyframe.view.camera, keyframe.rays
         shape = (camera.height, camera.width)
         right = np.zeros(shape, bool).reshape(-1)
         off = np.abs(rays.depth - truth.depth(keyframe.view).reshape(-1)[rays.pixels])
         right[rays.pixels] = rays.converged & (off < max(NEAR, 2 * regime.sigma))
-        kept = _edge_pixels(reconstruction, number, keyframe)
+        vertices, kept = _pixels_of_mesh(reconstruction, number, keyframe)
+        has_vertex = np.zeros(right.shape, bool)
+        has_vertex[vertices] = True
         for across, down in ((1, 0), (0, 1), (1, 1)):
             v, u = np.mgrid[:camera.height - down, :camera.width - across]
             a = (v * camera.width + u).reshape(-1)
@@ -180,31 +183,37 @@ def edges(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regim
             jump = (step > _SMOOTH * change) & (change > _JUMP * regime.h3)
             good = step <= _SMOOTH * np.maximum(change, regime.h3)
             stays = np.isin(a * np.int64(rays.table.size) + b, kept)
-            wide = jump & (change > _WIDE * regime.h3)
-            counts += [
-                jump.sum(), (jump & stays).sum(), wide.sum(), (wide & stays).sum(), good.sum(),
-                (good & ~stays).sum()]
+            jumps += np.histogram(change[jump] / regime.h3, _GAPS)[0]
+            left += np.histogram(change[jump & stays] / regime.h3, _GAPS)[0]
+            good_ones += int(good.sum())
+            cut += int((good & ~stays).sum())
+            cut_with_vertex += int((good & ~(has_vertex[a] & has_vertex[b])).sum())
     return {
-        'noise': name, 'across jumps > 4 h3': int(counts[0]), 'left %': _percent(*counts[1::-1]),
-        'across > 20 h3': int(counts[2]), 'left of these %': _percent(*counts[3:1:-1]),
-        'good': int(counts[4]), 'cut %': _percent(*counts[5:3:-1])}
+        'noise': name, 'across jumps > 4 h3': int(jumps.sum()),
+        'left %': _percent(left.sum(), jumps.sum())} | {
+        f'of {low:g} to {high:g} h3': _percent(*counts)
+        for low, high, *counts in zip(_GAPS, _GAPS[1:], left, jumps)} | {
+        'good': good_ones, 'cut %': _percent(cut, good_ones),
+        'with a vertex %': _percent(cut_with_vertex, good_ones),
+        'alone %': _percent(cut - cut_with_vertex, good_ones)}
 
 
 def _percent(part: int, whole: int) -> float | None:
     return 100 * float(part) / float(whole) if whole else None
 
 
-def _edge_pixels(
+def _pixels_of_mesh(
     reconstruction: Reconstruction, number: int, keyframe: Keyframe
-) -> NDArray[np.int64]:
-    """Return the edges of a keyframe's mesh as a number for each pair of pixels."""
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the pixels of a keyframe's vertices, and its edges as a number for each pair."""
     mesh, camera = reconstruction.mesh(number), keyframe.view.camera
     T = keyframe.view.T_world_camera
     x, y, z = ((mesh.vertices - T[:3, 3]) @ T[:3, :3]).T
     u = np.rint(camera.fx * x / z + camera.cx).astype(np.int64)
     v = np.rint(camera.fy * y / z + camera.cy).astype(np.int64)
     pixels = v * camera.width + u
-    return pixels[mesh.edges[:, 0]] * keyframe.rays.table.size + pixels[mesh.edges[:, 1]]
+    return pixels, (
+        pixels[mesh.edges[:, 0]] * keyframe.rays.table.size + pixels[mesh.edges[:, 1]])
 
 
 def starts(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regime) -> Row:

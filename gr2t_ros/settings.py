@@ -83,7 +83,8 @@ class Settings:
         'supports.', low=0.0, high=1.0, live=True)
     min_edge_likelihood: float = _parameter(
         0.5, 'Edges whose middle has less than this fraction of the larger of their two '
-        'vertices\' likelihoods are removed.', low=0.0, high=1.0, live=True)
+        'vertices\' likelihoods are removed, and those far steeper than the edges around them; '
+        '0 keeps all.', low=0.0, high=1.0, live=True)
     keyframe_translation: float = _parameter(
         0.1, 'A frame this far from the last keyframe becomes one, and so owns a mesh.',
         unit='m', low=0.0, high=100.0, live=True)

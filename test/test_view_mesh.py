@@ -2,7 +2,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A view's mesh: the grid's edges and faces, and what the thresholds cut."""
 import numpy as np
-from scenes_for_tests import pose
+import pytest
+from scenes_for_tests import looking_at_origin, plane_view, pose
 import trimesh
 
 from gr2t_ros.core.camera import Camera
@@ -15,11 +16,13 @@ WIDTH, HEIGHT = 40, 30
 CAMERA = Camera(WIDTH, HEIGHT, 80.0, 80.0, 19.5, 14.5)
 
 
-def mesh_of(depth, stride=1, T=None, **thresholds):
+def mesh_of(depth, stride=1, T=None, others=(), **thresholds):
     T = np.eye(4) if T is None else T
     view = View(depth.astype(np.float32), CAMERA, T, 0)
     density = ExactDensity(1.5, 0.003)
     density.add(view)
+    for other in others:
+        density.add(other)
     rays = rays_of(density, view, 1, 'robust')
     march(density, rays, np.arange(len(rays.pixels)))
     return density, view_mesh(
@@ -69,6 +72,35 @@ def test_edges_over_a_depth_jump_are_cut_and_with_them_their_faces():
     assert len(mesh.faces) == 2 * (WIDTH - 2) * (HEIGHT - 1)
     _, uncut = mesh_of(depth, edge=0.0)
     assert len(uncut.faces) == 2 * (WIDTH - 1) * (HEIGHT - 1)
+
+
+def test_a_step_is_cut_although_another_view_saw_a_surface_across_it():
+    depth = np.full((HEIGHT, WIDTH), 0.5)
+    depth[:, 20:] = 0.53
+    # from the left: a wall at x = 0, between columns 19 and 20, closes the gap
+    T = np.array([[0.0, 0, 1, -0.5], [0, 1, 0, 0], [-1, 0, 0, 0.515], [0, 0, 0, 1]])
+    wall = plane_view(CAMERA, T, [1, 0, 0], 0.0)
+    density, mesh = mesh_of(depth, others=[wall])
+    edge = mesh.vertices[WIDTH * 15 + np.array([19, 20])]
+    assert np.ptp(edge[:, 2]) == pytest.approx(0.03, abs=0.002)
+    at_ends, middle = density.likelihood(edge), density.likelihood(edge.mean(axis=0)[None])
+    assert middle > 0.5 * at_ends.max()  # what likelihood alone would keep
+    assert np.ptp(mesh.vertices[mesh.edges][:, :, 2], axis=1).max() < 0.01
+    assert len(mesh.faces) == 2 * (WIDTH - 2) * (HEIGHT - 1)
+
+
+def test_a_steep_surface_stays_whole():
+    normal = np.array([4.0, 0.0, -1.0]) / np.sqrt(17)
+    offset = -0.5 / np.sqrt(17)
+    depth = plane_view(CAMERA, np.eye(4), normal, offset).depth
+    depth = np.where((depth > 0.35) & (depth < 0.8), depth, np.nan)
+    columns = int(np.isfinite(depth[0]).sum())
+    T = looking_at_origin(normal, 1.5)
+    T[:3, 3] += [0.0, 0.0, 0.5]
+    _, mesh = mesh_of(depth, others=[plane_view(CAMERA, T, normal, offset)])
+    assert np.ptp(mesh.vertices[mesh.edges][:, :, 2], axis=1).max() > 0.04  # 13 h3
+    # two of the grid's corners have a diagonal that nothing goes on from
+    assert len(mesh.faces) >= 2 * (columns - 1) * (HEIGHT - 1) - 4
 
 
 def test_a_lonely_pixel_is_removed_with_its_edges_and_faces():
