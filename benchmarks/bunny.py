@@ -104,7 +104,7 @@ def main() -> None:
     about = machine()
     print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}; kernels ready '
           f'in {sum(warm_up(SETTINGS.updated({"density": name})) for name in DENSITIES):.1f} s')
-    if not tsdf.INSTALLED:
+    if not tsdf.installed():
         print('Open3D is not installed: no TSDF')
     distances: list[dict[str, Any]] = []
     costs: list[dict[str, Any]] = []
@@ -119,7 +119,7 @@ def main() -> None:
                     costs += [
                         {'density': density, 'threads': threads} | ray_cost(
                             reconstruction, threads) for threads in (1, 2)]
-        if tsdf.INSTALLED:
+        if tsdf.installed():
             distances.append({'images': case, 'density': 'TSDF'} | distances_mm(
                 surface.distances(tsdf_vertices(views))))
     for cost in costs:

@@ -144,7 +144,7 @@ def main() -> None:
         warm_up(bunny.SETTINGS.updated({'density': density}))
     print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, load '
           f'{about["load"]:.1f}')
-    if not tsdf.INSTALLED:
+    if not tsdf.installed():
         print('Open3D is not installed: no TSDF')
     tables: dict[str, list[Row]] = {title: [] for title in (
         'distance to the truth, mm', 'likelihood against distance, mm', 'a ray, one core')}
@@ -161,7 +161,7 @@ def main() -> None:
         against += tenths(noise, every, scale)
         clouds[noise] = every.likelihood / scale, every.error
         errors[noise] = {'gr2t': (Geometry.of(found[DEFAULT].meshes), found[DEFAULT].error)}
-        if tsdf.INSTALLED:
+        if tsdf.installed():
             other = tsdf_mesh(views, bunny.SETTINGS)
             error = surface.distances(other.vertices)
             kept.append(distances(noise, 'TSDF', error, None))

@@ -86,7 +86,7 @@ def main() -> None:
     print(f'{about["processor"]}, {about["cores"]} cores, load {about["load"]:.1f}')
     even, odd = views[::2], views[1::2][::_EVERY]
     off = {'gr2t': errors(ours(even, arguments.stride), odd)}
-    if tsdf.INSTALLED:
+    if tsdf.installed():
         off['TSDF'] = errors(theirs(even), odd)
     both = np.isfinite(sum(off.values()))
     observed = sum(int(np.isfinite(view.depth).sum()) for view in odd)

@@ -262,7 +262,7 @@ def main() -> None:
     about = machine()
     print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, load '
           f'{about["load"]:.1f}')
-    if not tsdf.INSTALLED:
+    if not tsdf.installed():
         print('Open3D is not installed: no TSDF')
     tables: dict[str, list[Row]] = {title: [] for title in (
         'distance to the truth, mm', 'scores', 'rms error / mean sigma, tenths by sigma', 'edges',
@@ -297,7 +297,7 @@ def main() -> None:
                 name, 'observed', Found(reconstruction, truth), regime, settings.min_confidence)
             scores.append(row)
             tenths.append(tenth)
-        if tsdf.INSTALLED:
+        if tsdf.installed():
             other = tsdf_mesh(views, settings)
             whole = Geometry(other.vertices, other.faces)
             rows = [

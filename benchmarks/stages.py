@@ -64,8 +64,8 @@ def measure_stages(data: Path, threads: int, count: int) -> list[dict[str, Any]]
 def _stages(views: Sequence[View], voxel_size: float, threads: int) -> dict[str, Any]:
     """Run our stages and Open3D's frame by frame, in turns: a busy machine slows both alike."""
     density = density_of(voxel_size)
-    peer = tsdf.Tsdf(voxel_size, DEPTH_MAX) if tsdf.INSTALLED else None
-    if tsdf.INSTALLED:  # what only a first call costs
+    peer = tsdf.Tsdf(voxel_size, DEPTH_MAX) if tsdf.installed() else None
+    if tsdf.installed():  # what only a first call costs
         _theirs(tsdf.Tsdf(voxel_size, DEPTH_MAX), views[0], True)
     before: Rays | None = None
     wall: list[dict[str, float]] = []

@@ -33,7 +33,7 @@ _FRAMES, _QUICK_FRAMES = 20, 4
 
 def stages(data: Path, quick: bool) -> object:
     """Measure a frame's stages on one core and on two."""
-    if not tsdf.INSTALLED:
+    if not tsdf.installed():
         print('Open3D is not installed: no comparison')
     count = _QUICK_FRAMES if quick else _FRAMES
     return [

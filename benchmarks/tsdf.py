@@ -8,6 +8,7 @@ default is 8), a ray cast that returns depths only, and surfaces that one frame 
 """
 from __future__ import annotations
 
+from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any, NamedTuple
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from gr2t_ros.core.view import View
 
 
-def _importable() -> bool:
+@cache
+def installed() -> bool:
     """Tell whether Open3D can be used; where it is installed but cannot be, print why."""
     if find_spec('open3d') is None:
         return False
@@ -30,7 +32,6 @@ def _importable() -> bool:
     return True
 
 
-INSTALLED = _importable()
 _TRUNCATION = 4.0  # voxels
 _SEEN = 0.5  # weight; below that of one frame
 _BLOCKS = 40000  # at the start; it grows

@@ -117,7 +117,7 @@ def rays_of(
     depth = depth.ravel()
     starts = depth[pixels]
     if start == 'robust' and n:
-        image, weights = _own_image(density, view, float(starts.max()))
+        image, weights = _own_image(density, view, float(starts.max()), pool)
         _over_chunks(
             pool, n, lambda part: robust_starts(
                 image, weights, camera.width, depth, pixels[part], starts[part]))
@@ -141,12 +141,14 @@ def _valid_pixels(depth: Floats, table: Doubles, stride: int) -> NDArray[np.int3
     return pixels[:count].copy()
 
 
-def _own_image(density: Density, view: View, deepest: float) -> tuple[Warped, Weights]:
+def _own_image(
+    density: Density, view: View, deepest: float, pool: Executor | None
+) -> tuple[Warped, Weights]:
     """Return a view's depth image in units of its bandwidth, and the lateral kernel."""
     if isinstance(density, VoxelDensity):
-        return density.image_of(view), density.weights
+        return density.image_of(view, pool), density.weights
     weights = Weights.of(density.pixel_bandwidth)
-    return warped(view, Scale.of(*density.bandwidth, deepest), weights), weights
+    return warped(view, Scale.of(*density.bandwidth, deepest), weights, pool), weights
 
 
 def march(

@@ -8,10 +8,8 @@ cubic spline. Nothing of the view is kept, and remove() subtracts the same numbe
 """
 from __future__ import annotations
 
-from collections.abc import Callable
 from concurrent.futures import Executor
 from math import pi, sqrt
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +18,7 @@ from ..errors import FrameError, InputError
 from . import blocks as lattice
 from .blocks import SIDE
 from .camera import Camera
+from .compiled import run_all
 from .view import View
 from .voxel_add import add_to_blocks, keys_of_view, Place
 from .voxel_query import jets, Lattice
@@ -131,8 +130,8 @@ class VoxelDensity:
         self._stale.clear()
         chosen = np.sort(lattice.with_neighbours(self.blocks, changed, self._change))
         parts = [chosen[i:i + _BLOCKS] for i in range(0, len(chosen), _BLOCKS)]
-        _all(pool, lattice.prefilter, [(self.blocks, part) for part in parts])
-        _all(pool, lattice.copy_margins, [(self.blocks, part) for part in parts])
+        run_all(pool, lattice.prefilter, [(self.blocks, part) for part in parts])
+        run_all(pool, lattice.copy_margins, [(self.blocks, part) for part in parts])
 
     def likelihood(self, points: Doubles, pool: Executor | None = None) -> Doubles:
         """
@@ -144,7 +143,7 @@ class VoxelDensity:
         points = np.ascontiguousarray(points, np.float64)
         directions = np.zeros((1, 3))
         found = np.zeros((len(points), 3))
-        _all(pool, jets, [
+        run_all(pool, jets, [
             (self.state, points[i:i + _POINTS], directions, np.zeros(1), found[i:i + _POINTS])
             for i in range(0, len(points), _POINTS)])
         return found[:, 0] / max(self.size, 1)
@@ -182,11 +181,11 @@ class VoxelDensity:
         found /= max(self.size, 1)
         return found[:, 0], found[:, 1], found[:, 2]
 
-    def image_of(self, view: View) -> Warped:
+    def image_of(self, view: View, pool: Executor | None = None) -> Warped:
         """Return a view's depth image in units of its bandwidth."""
         if self._recent is None or self._recent[0] is not view:
             before = self._recent[1] if self._recent else None
-            self._recent = (view, warped(view, self.scale, self.weights, before))
+            self._recent = (view, warped(view, self.scale, self.weights, pool, before))
         return self._recent[1]
 
     def _check_reach(self, view: View) -> None:
@@ -210,14 +209,14 @@ class VoxelDensity:
         place = Place(
             R_camera_world, -R_camera_world @ T[:3, 3], view.camera.parameters, width, height,
             factor)
-        image = self.image_of(view)
+        image = self.image_of(view, pool)
         support = empty_support(height, width)
         rows = [
             (i, min(i + _ROWS_OF_CELLS, len(image.low)))
             for i in range(0, len(image.low), _ROWS_OF_CELLS)]
-        _all(pool, find_support, [
+        run_all(pool, find_support, [
             (image, height, width, self.weights.lanes, support, *part) for part in rows])
-        keys = _all(pool, keys_of_view, [
+        keys = run_all(pool, keys_of_view, [
             (support, view.camera.rays, R_world_camera, T[:3, 3].copy(), self._depth_of_bins,
              SIDE * self.voxel_size, self.weights.lanes // 2, *part) for part in rows])
         self.size += sign
@@ -229,19 +228,8 @@ class VoxelDensity:
             self.blocks, np.concatenate(keys), self._change)
         if len(touched) == 0:
             return
-        _all(pool, add_to_blocks, [
+        run_all(pool, add_to_blocks, [
             (self.blocks, self.voxel_size, touched[i:i + _BLOCKS], place, image, support,
              self.scale, self.weights)
             for i in range(0, len(touched), _BLOCKS)])
         self._stale.append(touched)
-
-
-def _all(
-    pool: Executor | None, task: Callable[..., Any], arguments: list[tuple[Any, ...]]
-) -> list[Any]:
-    """Run a kernel for all tuples of arguments; results in their order."""
-    if pool is None:
-        return [task(*one) for one in arguments]
-    return [done.result() for done in [pool.submit(task, *one) for one in arguments]]
-
-

@@ -10,6 +10,7 @@ Images hold t / sqrt(32), as vector.window_strip wants it.
 """
 from __future__ import annotations
 
+from concurrent.futures import Executor
 from math import ceil, sqrt
 from typing import NamedTuple
 
@@ -17,7 +18,7 @@ from numba import njit, uint64
 import numpy as np
 from numpy.typing import NDArray
 
-from .compiled import uncounted
+from .compiled import run_all, uncounted
 from .vector import agreement, LANES, window_strip
 from .view import View
 
@@ -31,6 +32,7 @@ _SAMPLES = 8192  # of t(z), which goes on some way beyond depth_max
 _BEYOND = 1.1
 CELL = 4  # px; side of the squares that know their support
 SUPPORT = 3.0  # bandwidths along the depth at which a kernel ends
+_ROWS = 40 * CELL  # a task
 CELL_BITS = 2  # of CELL
 BINS = 2.0  # a bandwidth; resolution of the support
 _UNWARP = np.float32(BINS * _SQRT32)
@@ -144,11 +146,13 @@ class Support(NamedTuple):
 
 
 def warped(
-    view: View, scale: Scale, weights: Weights, reuse: Warped | None = None
+    view: View, scale: Scale, weights: Weights, pool: Executor | None = None,
+    reuse: Warped | None = None,
 ) -> Warped:
     """
     Return a view's depth image in units of its bandwidth.
 
+    :param pool: where to do it; None: in this thread
     :param reuse: an image that is no longer needed; where it is as large this one takes its place
     """
     height, width = view.depth.shape
@@ -164,19 +168,22 @@ def warped(
     depth = view.depth
     if view.camera.has_blind_pixels:
         depth = np.where(np.isnan(view.camera.rays[..., 0]), np.float32(np.nan), depth)
-    valid = _warp(np.ascontiguousarray(depth), scale, pad, image, low, high)
-    return Warped(image.ravel(), image.shape[1], pad, low, high, valid)
+    depth = np.ascontiguousarray(depth)
+    valid = run_all(pool, _warp, [
+        (depth, scale, pad, image, low, high, row, min(row + _ROWS, height))
+        for row in range(0, height, _ROWS)])
+    return Warped(image.ravel(), image.shape[1], pad, low, high, sum(valid))
 
 
 @uncounted(error_model='numpy')
 def _warp(
     depth: Floats, scale: Scale, pad: int, image: Floats, low: NDArray[np.int32],
-    high: NDArray[np.int32],
+    high: NDArray[np.int32], first: int, end: int,
 ) -> int:
     table, per_metre = scale.table, np.float32(scale.per_metre)
     last = np.float32((len(table) - 1) / _BEYOND * 1.00001)
     valid = 0
-    for v in range(depth.shape[0]):
+    for v in range(first, end):
         for u in range(depth.shape[1]):
             at = depth[v, u] * per_metre
             image[v + pad, u + pad] = INVALID
