@@ -316,7 +316,7 @@ class Reconstruction:
 
     def _notice_aliasing(self, view: View) -> list[str]:
         density = self.density
-        if not isinstance(density, VoxelDensity) or (
+        if 'aliasing' in self._noticed or not isinstance(density, VoxelDensity) or (
                 density.aliased_pixels <= _ALIASED * density.pixels):
             return []
         if not np.isfinite(view.depth).any():
