@@ -1,11 +1,18 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """What several test files share."""
+from __future__ import annotations
+
+from collections.abc import Iterator
 import hashlib
 import os
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
+
+if TYPE_CHECKING:
+    from ros_for_tests import Isolation, Observer
 
 PROJECT = Path(__file__).resolve().parents[1]
 DATA = PROJECT.parent / 'shared' / 'data'
@@ -24,3 +31,19 @@ def data() -> Path:
     if not DATA.is_dir():
         pytest.skip(f'no test data at {DATA}')
     return DATA
+
+
+@pytest.fixture
+def isolation() -> Isolation:
+    """Return a ROS domain that no other test uses."""
+    from ros_for_tests import Isolation
+    return Isolation()
+
+
+@pytest.fixture
+def observer(isolation: Isolation) -> Iterator[Observer]:
+    """Return a node of this process in the test's domain."""
+    from ros_for_tests import Observer
+    observer = Observer(isolation)
+    yield observer
+    observer.close()

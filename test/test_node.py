@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """gr2t_node in its own process, fed over DDS from another one."""
 from array import array
-from collections.abc import Iterator
 from pathlib import Path
 import re
 import signal
@@ -33,20 +32,6 @@ from gr2t_ros.ros.publishers import outputs_profile  # noqa: E402
 
 FRAMES = 6
 FLAT = 0.01  # m from the plane; beside a border kernels are one-sided
-
-
-@pytest.fixture
-def isolation() -> Isolation:
-    """Return a ROS domain that no other test uses."""
-    return Isolation()
-
-
-@pytest.fixture
-def observer(isolation: Isolation) -> Iterator[Observer]:
-    """Return a node of this process in the test's domain."""
-    observer = Observer(isolation)
-    yield observer
-    observer.close()
 
 
 @pytest.fixture(scope='module')

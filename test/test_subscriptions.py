@@ -1,7 +1,6 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """What gr2t_node takes from live topics, and what it says of those that it cannot."""
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -44,20 +43,6 @@ from gr2t_ros.tools.recorder import record
 FRAMES = 4
 FLAT = 0.01  # m from the plane; beside a border kernels are one-sided
 PLAIN = ('-p', 'max_wait_for_pose:=10.0')
-
-
-@pytest.fixture
-def isolation() -> Isolation:
-    """Return a ROS domain that no other test uses."""
-    return Isolation()
-
-
-@pytest.fixture
-def observer(isolation: Isolation) -> Iterator[Observer]:
-    """Return a node of this process in the test's domain."""
-    observer = Observer(isolation)
-    yield observer
-    observer.close()
 
 
 def wider(view: View) -> View:

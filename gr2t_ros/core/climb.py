@@ -20,6 +20,7 @@ from .compiled import uncounted
 Doubles = NDArray[np.float64]
 
 INTERVAL = 4.0  # h3; the search goes this far from the start
+SEEN = 4.0  # h3 between a point and its pixel's depth up to which a view counts as seeing it
 MAX_ITERATIONS = 50
 _TOLERANCE = 0.04  # h3; a Newton step this short is the last, and good to its cube
 _KINK = 0.02  # h3

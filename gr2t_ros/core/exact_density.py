@@ -11,7 +11,7 @@ view does not change; ExactDensity puts it in.
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from math import ceil, pi
+from math import ceil, pi, sqrt
 from typing import Any, NamedTuple
 
 from numba import njit
@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .camera import project_jet
-from .climb import aim, climb, CLIMBER, h3_at, INTERVAL, set_out
+from .climb import aim, climb, CLIMBER, h3_at, INTERVAL, SEEN, set_out
+from .compiled import run_all
 from .kernel import (
     axis_weights,
     Floats,
@@ -187,15 +188,20 @@ class ExactDensity:
         """
         points = np.ascontiguousarray(points, np.float64)
         out = np.zeros(len(points))
-        tasks = [
+        run_all(pool, _values, [
             (self.state, points[i:i + _CHUNK], out[i:i + _CHUNK])
-            for i in range(0, len(points), _CHUNK)]
-        if pool is None:
-            for task in tasks:
-                _values(*task)
-        else:
-            for done in [pool.submit(_values, *task) for task in tasks]:
-                done.result()
+            for i in range(0, len(points), _CHUNK)])
+        return out / max(self._views.size, 1)
+
+    def expected_peak(self, points: Doubles) -> Doubles:
+        """
+        Return what the likelihood would be on a plane that faces the views which see a point.
+
+        :param points: (n, 3) float64, world, metres
+        :return: (n,) float64, 1 / (px^2 m); 0 where no view sees the point
+        """
+        out = np.zeros(len(points))
+        _sum_expected(self.state, self.bandwidth, points, out)
         return out / max(self._views.size, 1)
 
     def along(
@@ -412,6 +418,30 @@ def _values(state: ViewSum, points: Doubles, out: Doubles) -> None:
                 views.depth, views.precision, first, stride, window, z,
                 scratch.columns, scratch.rows, scratch.sums)
         out[i] = total
+
+
+@njit(cache=True, nogil=True)
+def _sum_expected(
+    state: ViewSum, bandwidth: tuple[float, float, float], points: Doubles, out: Doubles
+) -> None:
+    """Add up 1 / (N_c sqrt(2 pi) h3) over the views that see each point."""
+    views = state.views
+    for i in range(len(points)):
+        for c in range(views.size):
+            T = views.T_camera_world[c]
+            x = T[0, 0] * points[i, 0] + T[0, 1] * points[i, 1] + T[0, 2] * points[i, 2] + T[0, 3]
+            y = T[1, 0] * points[i, 0] + T[1, 1] * points[i, 1] + T[1, 2] * points[i, 2] + T[1, 3]
+            z = T[2, 0] * points[i, 0] + T[2, 1] * points[i, 1] + T[2, 2] * points[i, 2] + T[2, 3]
+            seen, u, _, _, v, _, _ = project_jet(views.camera[c], x, 0.0, y, 0.0, z, 0.0)
+            width, height = views.layout[c, 5], views.layout[c, 6]
+            if not (seen and -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5):
+                continue
+            row = int(v + 0.5) + views.layout[c, 4]
+            column = int(u + 0.5) + views.layout[c, 4]
+            h3 = h3_at(bandwidth, z)
+            depth = views.depth[views.layout[c, 0] + row * views.layout[c, 1] + column]
+            if abs(depth - z) <= SEEN * h3:
+                out[i] += 1.0 / (sqrt(2 * pi) * h3 * width * height)
 
 
 @njit(cache=True, nogil=True)

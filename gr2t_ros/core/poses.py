@@ -350,6 +350,12 @@ class TransformTree:
         return f'tf is in separate parts, one of {parts[0]}, the other of {parts[1]}'
 
 
+def step(T_a: Pose, T_b: Pose) -> tuple[float, float]:
+    """Return how far two poses are apart, metres and radians."""
+    cosine = (np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1) / 2
+    return float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3])), float(np.arccos(np.clip(cosine, -1, 1)))
+
+
 def seconds(stamp_ns: int) -> str:
     """Return a stamp as text."""
     return f'{stamp_ns * 1e-9:.3f} s'

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from . import exact_density, voxel_query
 from .climb import aim, INTERVAL, Status
+from .compiled import run_all
 from .exact_density import ExactDensity
 from .view import View
 from .voxel_density import VoxelDensity
@@ -124,8 +125,7 @@ def rays_of(
     return Rays(
         pixels, camera.rays, np.array(view.T_world_camera, np.float64), starts, starts.copy(),
         np.zeros(n, np.float32), np.zeros(n, np.float32), np.zeros(n, np.uint8),
-        np.zeros(n, np.uint8),
-        np.full(n, -1, np.int32))
+        np.zeros(n, np.uint8), np.full(n, -1, np.int32))
 
 
 @njit(cache=True, nogil=True)
@@ -213,10 +213,5 @@ def _kernels(density: Density) -> ModuleType:
 
 def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None]) -> None:
     """Run task(slice) over all chunks; each ray is its own, so any split gives the same bits."""
-    parts = [slice(i, min(i + _CHUNK, count)) for i in range(0, count, _CHUNK)]
-    if pool is None:
-        for part in parts:
-            task(part)
-    else:
-        for done in [pool.submit(task, part) for part in parts]:
-            done.result()
+    run_all(pool, task, [
+        (slice(i, min(i + _CHUNK, count)),) for i in range(0, count, _CHUNK)])

@@ -24,6 +24,7 @@ from .blocks import new_blocks, with_keys
 from .camera import Camera
 from .exact_density import ExactDensity
 from .frozen import frozen, Room
+from .poses import step
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .shading import triangle_corners
 from .view import View
@@ -254,10 +255,7 @@ class Reconstruction:
                        if keyframe.view.camera_name == view.camera_name), None)
         if former is None:
             return True
-        last, new = former.T_world_camera, view.T_world_camera
-        moved = float(np.linalg.norm(new[:3, 3] - last[:3, 3]))
-        cosine = (np.trace(last[:3, :3].T @ new[:3, :3]) - 1) / 2
-        turned = float(np.arccos(np.clip(cosine, -1, 1)))
+        moved, turned = step(former.T_world_camera, view.T_world_camera)
         return (
             moved >= self.settings.keyframe_translation
             or turned >= self.settings.keyframe_rotation)

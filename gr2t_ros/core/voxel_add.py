@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from .blocks import Blocks, key_of, place_of, SIDE, VOXELS, with_room
 from .camera import project_jet
+from .climb import SEEN
 from .compiled import uncounted
 from .vector import LANES, window_strip
 from .warped import BINS, CELL, CELL_BITS, Scale, Support, Warped, Weights
@@ -20,7 +21,6 @@ Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 _FAST = {'contract', 'nsz', 'arcp'}
-_SEEN = 4.0  # bandwidths between a voxel and its pixel's depth at which it counts as seen
 
 
 class Place(NamedTuple):
@@ -284,7 +284,7 @@ def _add_windows(
     offset = image.pad - lanes // 2 - (lanes // 2 - 1)
     corner = image.pad - lanes // 2
     phases = np.float32(len(weight) // lanes)
-    zero, half, near = np.float32(0), np.float32(0.5), np.float32(_SEEN / sqrt(32.0))
+    zero, half, near = np.float32(0), np.float32(0.5), np.float32(SEEN / sqrt(32.0))
     shifted = np.float32(1 / sqrt(32.0))
     for m in range(count):
         n = uint64(scratch.chosen[uint64(m)])

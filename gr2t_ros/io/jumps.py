@@ -7,7 +7,7 @@ from collections import deque
 
 import numpy as np
 
-from ..core.poses import Pose
+from ..core.poses import Pose, step
 
 _DISTANCE, _ANGLE = 0.05, 0.05  # m, rad: smaller steps are noise
 _ACCELERATION = 10.0  # m/s^2 or rad/s^2: what a hand does at most
@@ -40,7 +40,7 @@ class JumpWatch:
             return None
         stamps = np.array([stamp for stamp, _ in self._poses])
         spans = np.diff(stamps) * 1e-9
-        steps = np.array([_step(a, b) for (_, a), (_, b) in zip(
+        steps = np.array([step(a, b) for (_, a), (_, b) in zip(
             self._poses, list(self._poses)[1:])])
         before, jump, after = steps
         # neighbours as if they had lasted as long
@@ -50,9 +50,3 @@ class JumpWatch:
         if not ((jump > limit) & (jump > _RATIO * usual)).any():
             return None
         return float(jump[0]), float(jump[1])
-
-
-def _step(T_a: Pose, T_b: Pose) -> tuple[float, float]:
-    """Return how far two poses are apart, metres and radians."""
-    cosine = (np.trace(T_a[:3, :3].T @ T_b[:3, :3]) - 1) / 2
-    return float(np.linalg.norm(T_b[:3, 3] - T_a[:3, 3])), float(np.arccos(np.clip(cosine, -1, 1)))
