@@ -154,7 +154,7 @@ def main() -> None:
     for noise, model in NOISE.items():
         views = bunny_views(mesh, model)
         with closing(bunny.reconstructed(views, 'voxel')) as reconstruction:
-            found, scale = cuts(reconstruction, surface), reconstruction.colour_scale()
+            found, scale = cuts(reconstruction, surface), reconstruction.colouring().scale
         every = found[EVERY]
         kept += [
             distances(noise, of, cut.error, len(every.error)) for of, cut in found.items()]

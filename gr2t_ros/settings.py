@@ -25,7 +25,7 @@ GROUPS = {
     'pixel_bandwidth': 'The density',
     'start': 'The rays and the meshes',
     'depth_min': 'The input',
-    'colour_map': 'The output',
+    'color_by': 'The output',
 }
 
 
@@ -135,8 +135,12 @@ class Settings:
         10, 'Images that may wait for the worker; when full the oldest is dropped, and counted.',
         low=1, high=1000)
 
+    color_by: str = _parameter(
+        'likelihood', 'What the colours show: the likelihood, or sigma, the standard deviation '
+        'along the ray. Blue is doubtful, red is sure.', choices=('likelihood', 'sigma'),
+        live=True)
     colour_map: str = _parameter(
-        'turbo', 'Colours from low (blue) to high (red) likelihood.',
+        'turbo', 'Colours from doubtful (blue) to sure (red).',
         choices=('turbo', 'jet', 'coolwarm', 'viridis'), live=True)
     publish_rate: float = _parameter(
         2.0, 'Meshes published per second, at most.', unit='Hz', low=0.05, high=60.0, live=True)

@@ -9,6 +9,7 @@ from numpy.testing import assert_allclose
 import pytest
 import trimesh
 
+from gr2t_ros.core.colour import Colouring
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.errors import InputError
 from gr2t_ros.io import ply
@@ -119,7 +120,8 @@ def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):
         vertex_confidence=np.ones(len(noise), np.float32),
         faces=ball.faces.astype(np.int32), edges=ball.edges_unique.astype(np.int32),
         edge_likelihood=np.ones(len(ball.edges_unique), np.float32))
-    ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], 1.0, 'turbo')
+    colouring = Colouring('likelihood', 1.0, 'turbo')
+    ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], colouring)
     ball.export(tmp_path / 'truth.stl')
     assert len(likelihoods(load_mesh(tmp_path / 'mesh.ply'))) == len(ball.vertices)
     files = [str(tmp_path / 'mesh.ply'), str(tmp_path / 'truth.stl')]

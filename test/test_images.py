@@ -1,6 +1,6 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""The newest keyframe as depth image, camera_info and likelihood image."""
+"""The newest keyframe as depth image, camera_info and images of how sure the depths are."""
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +10,7 @@ from scenes_for_tests import looking_at_origin, plane_view
 
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.reconstruction import Reconstruction
+from gr2t_ros.core.view_mesh import view_mesh
 from gr2t_ros.io import messages
 from gr2t_ros.settings import Settings
 
@@ -45,10 +46,13 @@ def test_what_others_read_of_it(camera: Camera, stride: int) -> None:
     """Depths and rays are those of the marched pixels, also with a smaller image's camera."""
     reconstruction = map_of(camera, stride)
     keyframe, = reconstruction.keyframes
-    depth, info, likelihood = (
-        deserialize_message(serialize_message(message), type(message))
-        for message in images(keyframe, 1, stride))
-    for message in (depth, info, likelihood):
+    sent = {
+        topic: deserialize_message(serialize_message(message), type(message))
+        for topic, message in images(keyframe, reconstruction.density, stride).items()}
+    depth, info = sent['depth/image'], sent['depth/camera_info']
+    assert sent.keys() == {
+        'depth/image', 'depth/camera_info', 'likelihood/image', 'sigma/image', 'confidence/image'}
+    for message in sent.values():
         assert Time.from_msg(message.header.stamp).nanoseconds == 1_234_567_890_123
         assert message.header.frame_id == 'optical'
     v, u = np.divmod(keyframe.rays.pixels[keyframe.rays.converged], camera.width)
@@ -58,8 +62,13 @@ def test_what_others_read_of_it(camera: Camera, stride: int) -> None:
     expected[v // stride, u // stride] = keyframe.rays.depth[keyframe.rays.converged]
     assert 0.5 < np.isfinite(expected).mean() < 1
     np.testing.assert_array_equal(z, expected)
-    likely = messages.depth(likelihood)
-    assert (likely[np.isfinite(z)] > 0).all() and np.isnan(likely[np.isnan(z)]).all()
+    likely, sigma, confidence = (
+        messages.depth(sent[f'{name}/image']) for name in ('likelihood', 'sigma', 'confidence'))
+    for image in (likely, sigma, confidence):
+        assert (image[np.isfinite(z)] > 0).all() and np.isnan(image[np.isnan(z)]).all()
+    mesh = view_mesh(reconstruction.density, keyframe.rays, camera.width, stride, 0.0, 0.0)
+    np.testing.assert_array_equal(sigma[np.isfinite(z)], mesh.vertex_sigma)
+    np.testing.assert_array_equal(confidence[np.isfinite(z)], mesh.vertex_confidence)
     read = messages.camera(info, rectified=False)
     np.testing.assert_allclose(read.rays, camera.rays[::stride, ::stride], atol=1e-7)
     np.testing.assert_array_equal(np.reshape(info.p, (3, 4))[:, :3].ravel(), info.k)
@@ -80,7 +89,7 @@ def test_sent_when_something_is_new_to_a_listener(observer: Observer) -> None:
     assert not outputs.publish(reconstruction), 'nobody listens'
     for kind, topic in (
             (Image, 'depth/image'), (CameraInfo, 'depth/camera_info'),
-            (Image, 'likelihood/image')):
+            (Image, 'likelihood/image'), (Image, 'sigma/image'), (Image, 'confidence/image')):
         received = observer.collect(kind, f'observer/{topic}', outputs_profile(10))
         observer.spin_until(lambda: outputs.publish(reconstruction), 'the new listener')
         observer.spin_until(received.__len__, topic)

@@ -19,6 +19,13 @@ pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
 from geometry_msgs.msg import PoseStamped  # noqa: E402
+from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
+from rcl_interfaces.srv import (  # noqa: E402
+    DescribeParameters,
+    GetParameters,
+    ListParameters,
+    SetParameters,
+)
 from rclpy.qos import qos_profile_sensor_data, QoSProfile  # noqa: E402
 from rclpy.serialization import deserialize_message  # noqa: E402
 from rclpy.time import Time  # noqa: E402
@@ -53,7 +60,7 @@ def test_map_from_a_played_bag(
         images = [
             observer.collect(kind, f'/gr2t/{topic}', outputs_profile(10)) for kind, topic in (
                 (Image, 'depth/image'), (CameraInfo, 'depth/camera_info'),
-                (Image, 'likelihood/image'))]
+                *((Image, f'{name}/image') for name in ('likelihood', 'sigma', 'confidence')))]
         assert not observer.call(Trigger, 'save_snapshot').success
 
         isolation.play(bag)
@@ -68,7 +75,7 @@ def test_map_from_a_played_bag(
         observer.spin_until(lambda: all(images), 'the images')
         _check_images(*(
             deserialize_message(messages[0], kind)
-            for kind, messages in zip((Image, CameraInfo, Image), images)))
+            for kind, messages in zip((Image, CameraInfo, Image, Image, Image), images)))
 
         def reported() -> bool:
             """Tell whether the newest status knows the last image."""
@@ -94,6 +101,17 @@ def test_map_from_a_played_bag(
         # someone who comes late gets everything
         late = observer.collect(MarkerArray, '/gr2t/mesh', outputs_profile(10))
         observer.spin_until(lambda: _markers(late).keys() == markers.keys(), 'all markers again')
+
+        # colours may show something else, at once
+        arrays.clear()
+        by_sigma = Parameter(name='color_by', value=ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value='sigma'))
+        answer = observer.call(SetParameters, 'set_parameters', parameters=[by_sigma])
+        assert answer.results[0].successful
+        observer.spin_until(lambda: _markers(arrays).keys() == markers.keys(), 'other colours')
+        for number, marker in _markers(arrays).items():
+            assert marker.points == markers[number].points
+            assert marker.colors != markers[number].colors
 
         arrays.clear()
         assert observer.call(Trigger, 'reset').success
@@ -157,18 +175,21 @@ def _check_cloud(cloud: PointCloud2) -> None:
     assert (points[:, 4] > 0).all()
 
 
-def _check_images(depth: Image, info: CameraInfo, likelihood: Image) -> None:
-    assert depth.header == info.header == likelihood.header
+def _check_images(depth: Image, info: CameraInfo, *of_depths: Image) -> None:
+    assert all(message.header == depth.header for message in (info, *of_depths))
     assert depth.header.frame_id == OPTICAL_FRAME
     stamp_ns = Time.from_msg(depth.header.stamp).nanoseconds
     view, = (view for view in plane_views(FRAMES) if view.stamp_ns == stamp_ns)
     assert (info.width, info.height) == (view.camera.width, view.camera.height)
-    z, likely = (
+    z, likely, sigma, confidence = (
         np.frombuffer(item.data, np.float32).reshape(info.height, info.width)
-        for item in (depth, likelihood))
+        for item in (depth, *of_depths))
     found = np.isfinite(z)
     assert found.mean() > 0.9
-    assert (likely[found] > 0).all() and np.isnan(likely[~found]).all()
+    assert all(np.isnan(image[~found]).all() for image in (likely, sigma, confidence))
+    assert (likely[found] > 0).all()
+    assert 0 < np.median(sigma[found]) < FLAT
+    assert 0.3 < np.median(confidence[found]) < 1
     fx, _, cx, _, fy, cy, *_ = info.k
     v, u = np.nonzero(found)
     points = np.column_stack([(u - cx) / fx, (v - cy) / fy, np.ones(len(u))]) * z[found][:, None]
@@ -236,13 +257,6 @@ def test_all_parameters_are_described(
     isolation: Isolation, observer: Observer, tmp_path: Path
 ) -> None:
     """`ros2 param describe` shows help, unit and range; what cannot change says so."""
-    from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
-    from rcl_interfaces.srv import (
-        DescribeParameters,
-        GetParameters,
-        ListParameters,
-        SetParameters,
-    )
     with NodeProcess(isolation, tmp_path, '-p', 'depth_max:=4') as node:
         names = observer.call(ListParameters, 'list_parameters').result.names
         assert {'depth_max', 'world_frame', 'publish_rate', 'snapshot_on_exit'} <= set(names)

@@ -2,15 +2,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """A snapshot is read whole by this package and by other programs, or is not there at all."""
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from plyfile import PlyData
 import pytest
 
-from gr2t_ros.core.colour import colours
+from gr2t_ros.core.colour import Colouring, colours
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.errors import Gr2tError, InputError
 from gr2t_ros.io import ply
+
+COLOURING = Colouring('likelihood', 2.0, 'turbo')
 
 
 def grid(size: int = 9, stride: int = 1, z: float = 1.0) -> ViewMesh:
@@ -42,7 +46,7 @@ def two_views(stride: int) -> Iterable[tuple[int, ViewMesh]]:
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
     """Return a file with two_views, in a folder that had to be made."""
-    return ply.write_views(tmp_path / 'new' / 'mesh.ply', two_views, 2.0, 'turbo').path
+    return ply.write_views(tmp_path / 'new' / 'mesh.ply', two_views, COLOURING).path
 
 
 def test_what_is_written_is_read_back(file: Path) -> None:
@@ -60,6 +64,21 @@ def test_what_is_written_is_read_back(file: Path) -> None:
     np.testing.assert_array_equal(np.unique(found.vertex_view), [4, 7])
     np.testing.assert_array_equal(
         found.vertex_colours, colours(mesh.vertex_likelihood, 2.0, 'turbo'))
+
+
+def test_colours_may_show_the_deviation(tmp_path: Path) -> None:
+    """An edge has the colour of its vertices' mean; likelihoods stay what they are."""
+    colouring = Colouring('sigma', 4e-4, 'jet')
+    path = ply.write_views(tmp_path / 'mesh.ply', two_views, colouring).path
+    found = ply.read(path)
+    sigma = found.mesh.vertex_sigma
+    np.testing.assert_array_equal(found.vertex_colours, colours(4e-4 - sigma, 4e-4, 'jet'))
+    np.testing.assert_array_equal(found.mesh.edge_likelihood, ply.read(
+        ply.write_views(tmp_path / 'other.ply', two_views, COLOURING).path).mesh.edge_likelihood)
+    edges = PlyData.read(str(path))['gr2t_edge']
+    np.testing.assert_array_equal(
+        np.stack([edges[name] for name in ('red', 'green', 'blue')], axis=-1),
+        colours(4e-4 - sigma[found.mesh.edges].mean(axis=1), 4e-4, 'jet'))
 
 
 def test_the_header_is_that_of_the_design(file: Path) -> None:
@@ -109,7 +128,7 @@ def test_meshlab_reads_it(file: Path) -> None:
 
 
 def test_too_many_faces_are_decimated_and_it_is_said(tmp_path: Path) -> None:
-    written = ply.write_views(tmp_path / 'mesh.ply', two_views, 2.0, 'turbo', max_faces=70)
+    written = ply.write_views(tmp_path / 'mesh.ply', two_views, COLOURING, max_faces=70)
     assert written.stride == 2
     assert (written.vertices, written.edges, written.faces) == (50, 112, 64)
     assert len(ply.read(written.path).mesh.faces) == 64
@@ -121,12 +140,13 @@ def test_hopeless_strides_are_not_tried(tmp_path: Path) -> None:
     def meshes(stride: int) -> Iterable[tuple[int, ViewMesh]]:
         tried.append(stride)
         return two_views(stride)
-    ply.write_views(tmp_path / 'mesh.ply', meshes, 2.0, 'turbo', 20, expected_vertices=162)
+    ply.write_views(tmp_path / 'mesh.ply', meshes, COLOURING, 20, expected_vertices=162)
     assert tried == [4]
 
 
 def test_a_mesh_without_anything_is_a_file_too(tmp_path: Path) -> None:
-    written = ply.write_views(tmp_path / 'mesh.ply', lambda stride: [], 0.0, 'turbo')
+    written = ply.write_views(
+        tmp_path / 'mesh.ply', lambda stride: [], replace(COLOURING, scale=0.0))
     assert written.vertices == 0
     assert ply.read(written.path).mesh.faces.shape == (0, 3)
 
@@ -136,7 +156,7 @@ def test_a_view_of_which_nothing_is_left_may_be_among_them(tmp_path: Path) -> No
         np.zeros((0, 3)), *np.zeros((3, 0), np.float32), np.zeros((0, 3), np.int32),
         np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
     written = ply.write_views(
-        tmp_path / 'mesh.ply', lambda stride: [(0, none), (1, grid()), (2, none)], 2.0, 'turbo')
+        tmp_path / 'mesh.ply', lambda stride: [(0, none), (1, grid()), (2, none)], COLOURING)
     assert set(ply.read(written.path).vertex_view) == {1}
 
 
@@ -146,7 +166,7 @@ def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, limits[1]))  # no file may be larger
     try:
         with pytest.raises(Gr2tError, match=r'cannot write .*mesh\.ply: File too large'):
-            ply.write_views(tmp_path / 'mesh.ply', two_views, 2.0, 'turbo')
+            ply.write_views(tmp_path / 'mesh.ply', two_views, COLOURING)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list(tmp_path.iterdir())
@@ -160,7 +180,7 @@ def test_a_failure_leaves_the_older_file_whole(file: Path) -> None:
         raise OSError(28, 'No space left on device')
 
     with pytest.raises(Gr2tError, match=r'mesh\.ply: No space left on device'):
-        ply.write_views(file, breaks, 2.0, 'turbo')
+        ply.write_views(file, breaks, COLOURING)
     assert file.read_bytes() == before
     assert list(file.parent.iterdir()) == [file]
 
@@ -170,7 +190,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     (tmp_path / 'mesh.ply').mkdir()
     (tmp_path / 'inside').write_text('a file where a folder is needed')
     with pytest.raises(Gr2tError, match=f'cannot write .*{name}'):
-        ply.write_views(tmp_path / name, two_views, 2.0, 'turbo')
+        ply.write_views(tmp_path / name, two_views, COLOURING)
     assert sorted(item.name for item in tmp_path.iterdir()) == ['inside', 'mesh.ply']
 
 

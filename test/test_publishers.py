@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gr2t_ros.core.colour import colours
+from gr2t_ros.core.colour import Colouring, colours
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.settings import Settings
 
@@ -21,11 +21,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 from gr2t_ros.ros import publishers
 from gr2t_ros.ros.publishers import (
     cloud,
+    lines,
     MapPublishers,
     outputs_profile,
     point_cloud,
     triangles,
 )
+
+LIKELIHOOD = Colouring('likelihood', 1.0, 'turbo')
 
 
 def mesh(faces: int = 2, likelihood: float = 1.0) -> ViewMesh:
@@ -46,14 +49,14 @@ class Map:
     def __init__(self, *meshes: ViewMesh) -> None:
         self.keyframes = list(meshes)
         self.asked: list[int] = []
-        self.scale = 1.0
+        self.by, self.scale = 'likelihood', 1.0
 
     def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
         self.asked.append(keyframe)
         return self.keyframes[keyframe]
 
-    def colour_scale(self) -> float:
-        return self.scale
+    def colouring(self) -> Colouring:
+        return Colouring(self.by, self.scale, 'turbo')
 
 
 @pytest.fixture
@@ -144,6 +147,10 @@ def test_colours_follow_the_scale(observer: Observer) -> None:
     outputs.change([0])
     outputs.publish(reconstruction, 'map', 0, 2)
     assert viewer.next() == {0: 3, 1: 6}
+    reconstruction.by, reconstruction.scale = 'sigma', 2.2  # as much: it is no share of the views
+    outputs.change([0])
+    outputs.publish(reconstruction, 'map', 0, 4)
+    assert viewer.next() == {0: 3}
 
 
 def test_edges_for_who_wants_them(observer: Observer) -> None:
@@ -175,21 +182,21 @@ def test_edges_for_who_wants_them(observer: Observer) -> None:
 def test_shading_shows_the_shape_and_can_be_left_out() -> None:
     """A face towards the light keeps its colour, one that looks away is darker."""
     strip = mesh(1)
-    towards = triangles(0, strip, 1.0, 'turbo', shading=True).colours.astype(int)
+    towards = triangles(0, strip, LIKELIHOOD, shading=True).colours.astype(int)
     away = replace(strip, faces=np.ascontiguousarray(strip.faces[:, ::-1]))
-    dark = triangles(0, away, 1.0, 'turbo', shading=True).colours.astype(int)
-    pure = triangles(0, strip, 1.0, 'turbo', shading=False).colours
+    dark = triangles(0, away, LIKELIHOOD, shading=True).colours.astype(int)
+    pure = triangles(0, strip, LIKELIHOOD, shading=False).colours
     np.testing.assert_array_equal(pure, colours(strip.vertex_likelihood, 1.0, 'turbo'))
     bright, less = sorted((towards.sum(), dark.sum()), reverse=True)
     assert pure.astype(int).sum() >= bright > 1.4 * less > 0
     flat = replace(strip, vertices=np.zeros_like(strip.vertices))
-    assert len(triangles(0, flat, 1.0, 'turbo', shading=True).colours) == 3
+    assert len(triangles(0, flat, LIKELIHOOD, shading=True).colours) == 3
 
 
 def test_a_cloud_as_viewers_read_it() -> None:
     """Likelihoods of all keyframes are those of now, however old their clouds are."""
     old, new = cloud(mesh(2, 0.8), views=1), cloud(mesh(2, 0.5), views=2)
-    message = point_cloud([old, new], 2, 0.5, 'turbo')
+    message = point_cloud([old, new], 2, Colouring('likelihood', 0.5, 'turbo'))
     assert [(field.name, field.offset, field.datatype) for field in message.fields] == [
         (name, 4 * i, 7) for i, name in enumerate(
             ('x', 'y', 'z', 'rgb', 'likelihood', 'sigma', 'confidence'))]
@@ -201,8 +208,23 @@ def test_a_cloud_as_viewers_read_it() -> None:
     assert message.row_step == len(message.data)
 
 
+def test_deviations_as_colours() -> None:
+    """Vertices, edges and points; the sure ones in the colour of a high likelihood."""
+    by_sigma = Colouring('sigma', 2e-3, 'jet')
+    strip = replace(
+        mesh(1), vertex_sigma=np.float32([0, 1e-3, np.inf]),
+        edges=np.array([[0, 1], [1, 2]], np.int32), edge_likelihood=np.ones(2, np.float32))
+    expected = colours([1.0, 0.5, 0.0], 1.0, 'jet')
+    np.testing.assert_array_equal(triangles(0, strip, by_sigma, shading=False).colours, expected)
+    np.testing.assert_array_equal(
+        lines(0, strip, by_sigma).colours, colours([0.75, 0.75, 0.0, 0.0], 1.0, 'jet'))
+    message = point_cloud([cloud(strip, 1)], 1, by_sigma)
+    rgb = np.frombuffer(message.data, np.uint8).reshape(message.width, -1)[:, 14:11:-1]
+    np.testing.assert_array_equal(rgb, expected)
+
+
 def test_too_many_points_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(publishers, 'MAX_POINTS', 10)
-    message = point_cloud([cloud(mesh(23), 1)], 1, 1.0, 'turbo')
+    message = point_cloud([cloud(mesh(23), 1)], 1, LIKELIHOOD)
     assert message.width == 9
     assert isinstance(message, PointCloud2)

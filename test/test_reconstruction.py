@@ -121,8 +121,14 @@ def test_the_bound_on_keyframes_is_kept_and_said():
 def test_colours_have_a_scale_and_an_empty_map_has_none():
     reconstruction, _ = run(orbit(3))
     likelihoods = np.concatenate([m.vertex_likelihood for _, m in reconstruction.meshes()])
-    assert likelihoods.min() < reconstruction.colour_scale() <= likelihoods.max()
-    assert Reconstruction(SETTINGS).colour_scale() == 0
+    assert likelihoods.min() < reconstruction.colouring().scale <= likelihoods.max()
+    assert Reconstruction(SETTINGS).colouring().scale == 0
+    sigmas = np.concatenate([m.vertex_sigma for _, m in reconstruction.meshes()])
+    reconstruction.settings = SETTINGS.updated({'color_by': 'sigma', 'colour_map': 'jet'})
+    colouring = reconstruction.colouring()
+    assert (colouring.by, colouring.colour_map) == ('sigma', 'jet')
+    assert sigmas.min() < colouring.scale <= sigmas.max()
+    assert Reconstruction(reconstruction.settings).colouring().scale == 0
 
 
 def test_a_depth_image_of_the_wrong_size_is_one_frame_s_error():

@@ -7,7 +7,7 @@ from PIL import Image
 import pytest
 import trimesh
 
-from gr2t_ros.core.colour import colours
+from gr2t_ros.core.colour import Colouring, colours
 from gr2t_ros.errors import Gr2tError
 from gr2t_ros.tools.orbit import looking_at, orbit
 from gr2t_ros.tools.raster import rasterise, vertex_normals
@@ -128,12 +128,15 @@ def test_a_wall_seen_from_one_side_is_looked_at_from_there():
     assert T_world_camera[2, 1] < 0  # upright
 
 
-def test_the_preview_is_a_picture_with_a_scale_in_the_mesh_s_colours(tmp_path):
+@pytest.mark.parametrize(('by', 'likelihood', 'sigma'), [
+    ('likelihood', 3e-6, 0.0), ('likelihood', 3e-6, 3e-6), ('sigma', 0.0, 0.0)])
+def test_the_preview_is_a_picture_with_a_scale_in_the_mesh_s_colours(
+        by, likelihood, sigma, tmp_path):
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.1)
-    likelihood = np.full(len(ball.vertices), 3e-6)
     preview(
-        tmp_path / 'ball.png', ball.vertices, ball.faces, likelihood, 3e-6, 'turbo',
-        title='ball', width=640, height=400)
+        tmp_path / 'ball.png', ball.vertices, ball.faces, np.full(len(ball.vertices), likelihood),
+        np.full(len(ball.vertices), sigma), Colouring(by, 3e-6, 'turbo'), title='ball',
+        width=640, height=400)
     picture = np.asarray(Image.open(tmp_path / 'ball.png').convert('RGB')).astype(int)
     assert picture.shape == (476, 640, 3)
     footer = picture[400:].reshape(-1, 3)
@@ -146,7 +149,8 @@ def test_the_preview_is_a_picture_with_a_scale_in_the_mesh_s_colours(tmp_path):
 
 @pytest.mark.parametrize('faces', [np.zeros((0, 3), int), np.array([(0, 1, 2)])])
 def test_a_preview_of_nothing_is_still_a_picture(faces, tmp_path):
-    preview(tmp_path / 'a.png', np.zeros((3, 3)), faces, np.zeros(3), 0.0, 'turbo', width=480)
+    preview(tmp_path / 'a.png', np.zeros((3, 3)), faces, np.zeros(3), np.zeros(3),
+            Colouring('likelihood', 0.0, 'turbo'), width=480)
     assert Image.open(tmp_path / 'a.png').size == (480, 876)
 
 
@@ -156,8 +160,8 @@ def test_vertices_that_no_triangle_uses_do_not_change_the_picture(tmp_path):
     for name, vertices, faces in (
             ('a.png', ball.vertices, ball.faces), ('b.png', stray, ball.faces + 1)):
         preview(
-            tmp_path / name, vertices, faces, np.ones(len(vertices)), 1.0, 'turbo',
-            width=480, height=120)
+            tmp_path / name, vertices, faces, np.ones(len(vertices)), np.ones(len(vertices)),
+            Colouring('likelihood', 1.0, 'turbo'), width=480, height=120)
     assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
 
 
@@ -166,4 +170,4 @@ def test_a_preview_that_cannot_be_written_says_where(tmp_path):
     with pytest.raises(Gr2tError, match='file'):
         preview(
             tmp_path / 'file' / 'a.png', np.zeros((0, 3)), np.zeros((0, 3), int), np.zeros(0),
-            1.0, 'turbo', width=480, height=120)
+            np.zeros(0), Colouring('likelihood', 1.0, 'turbo'), width=480, height=120)

@@ -22,6 +22,8 @@ from ..errors import FrameError
 from ..settings import Settings
 from .blocks import new_blocks, with_keys
 from .camera import Camera
+from .colour import Colouring
+from .confidence import deviations
 from .exact_density import ExactDensity
 from .frozen import frozen, Room
 from .poses import step
@@ -32,6 +34,7 @@ from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
 from .voxel_density import VoxelDensity
 
 _SLICE = 65536  # rays marched between two looks at the clock
+_COLOUR_SAMPLES = 50_000  # deviations that make a colour scale
 _ALIASED = 0.05  # share of pixels too near for the voxel size that is worth a notice
 
 
@@ -187,14 +190,27 @@ class Reconstruction:
         for number in range(len(self.keyframes)):
             yield number, self.mesh(number, stride)
 
-    def colour_scale(self) -> float:
-        """Return the robust maximum of the likelihood over all keyframes, 1 / (px^2 m)."""
+    def colouring(self) -> Colouring:
+        """Return how points are coloured, up to the robust maximum over all keyframes."""
+        s = self.settings
+        values = self._deviations() if s.color_by == 'sigma' else self._likelihoods()
+        scale = float(np.percentile(values, ROBUST_MAXIMUM)) if len(values) else 0.0
+        return Colouring(s.color_by, scale, s.colour_map)
+
+    def _likelihoods(self) -> NDArray[np.floating]:
         totals = [
             keyframe.rays.total[keyframe.rays.converged] for keyframe in self.keyframes]
-        likely = np.concatenate(totals) if totals else np.zeros(0)
-        if not len(likely):
-            return 0.0
-        return float(np.percentile(likely, ROBUST_MAXIMUM)) / self.density.size
+        return np.concatenate(totals) / self.density.size if totals else np.zeros(0)
+
+    def _deviations(self) -> NDArray[np.float32]:
+        """Return sigmas (m) of some rays of each keyframe: each has to ask the density."""
+        samples = [np.zeros(0, np.float32)]
+        for keyframe in self.keyframes:
+            found = np.flatnonzero(keyframe.rays.converged)
+            step = len(self.keyframes) * len(found) // _COLOUR_SAMPLES + 1
+            samples.append(deviations(self.density, keyframe.rays, found[::step]))
+        sigma = np.concatenate(samples)
+        return sigma[np.isfinite(sigma)]
 
     def frozen(self, room: Room) -> Reconstruction:
         """

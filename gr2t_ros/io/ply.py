@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyParseError
 
-from ..core.colour import colours
+from ..core.colour import Colouring
 from ..core.view_mesh import ViewMesh
 from ..errors import InputError
 from .files import whole_file
@@ -73,8 +73,7 @@ class PlyMesh:
 def write_views(
     path: Path,
     meshes: Callable[[int], Iterable[tuple[int, ViewMesh]]],
-    scale: float,
-    colour_map: str,
+    colouring: Colouring,
     max_faces: int = MAX_FACES,
     expected_vertices: int = 0,
 ) -> Written:
@@ -83,8 +82,7 @@ def write_views(
 
     :param path: the file; written beside this name and renamed when complete
     :param meshes: from a ray stride to (number of the view, its mesh), as Reconstruction.meshes
-    :param scale: the likelihood that gets the last colour
-    :param colour_map: one of the choices of Settings.colour_map
+    :param colouring: of vertices and edges
     :param max_faces: the ray stride grows until no more faces than this are written
     :param expected_vertices: about how many there are at stride 1, so that strides which give far
         too many faces are not tried
@@ -97,7 +95,7 @@ def write_views(
                   TemporaryFile(dir=path.parent) as faces,
                   TemporaryFile(dir=path.parent) as edges):
                 counts = _spool(
-                    meshes(stride), scale, colour_map, max_faces, vertices, faces, edges)
+                    meshes(stride), colouring, max_faces, vertices, faces, edges)
                 if counts is not None:
                     out.write(_header(*counts))
                     for spool in (vertices, faces, edges):
@@ -108,7 +106,7 @@ def write_views(
 
 
 def _spool(
-    meshes: Iterable[tuple[int, ViewMesh]], scale: float, colour_map: str, max_faces: int,
+    meshes: Iterable[tuple[int, ViewMesh]], colouring: Colouring, max_faces: int,
     vertices: BinaryIO, faces: BinaryIO, edges: BinaryIO,
 ) -> tuple[int, int, int] | None:
     """Write the rows, return the numbers of vertices, faces, edges; None if they are too many."""
@@ -117,7 +115,8 @@ def _spool(
         vertex_rows = np.empty(len(mesh.vertices), _VERTEX)
         for axis, name in enumerate('xyz'):
             vertex_rows[name] = mesh.vertices[:, axis]
-        _colour(vertex_rows, mesh.vertex_likelihood, scale, colour_map)
+        _colour(vertex_rows, colouring.colours(mesh.vertex_likelihood, mesh.vertex_sigma))
+        vertex_rows['likelihood'] = mesh.vertex_likelihood
         vertex_rows['sigma'] = mesh.vertex_sigma
         vertex_rows['confidence'] = mesh.vertex_confidence
         vertex_rows['view'] = view
@@ -127,7 +126,9 @@ def _spool(
         edge_rows = np.empty(len(mesh.edges), _EDGE)
         edge_rows['vertex1'] = mesh.edges[:, 0] + vertex_count
         edge_rows['vertex2'] = mesh.edges[:, 1] + vertex_count
-        _colour(edge_rows, mesh.edge_likelihood, scale, colour_map)
+        _colour(edge_rows, colouring.edge_colours(
+            mesh.edge_likelihood, mesh.vertex_sigma, mesh.edges))
+        edge_rows['likelihood'] = mesh.edge_likelihood
         vertex_count += len(vertex_rows)
         face_count += len(face_rows)
         edge_count += len(edge_rows)
@@ -139,11 +140,7 @@ def _spool(
     return vertex_count, face_count, edge_count
 
 
-def _colour(
-    rows: NDArray[Any], likelihood: NDArray[np.float32], scale: float, colour_map: str
-) -> None:
-    rows['likelihood'] = likelihood
-    colour = colours(likelihood, scale, colour_map)
+def _colour(rows: NDArray[Any], colour: NDArray[np.uint8]) -> None:
     for channel, (name, _) in enumerate(_COLOUR):
         rows[name] = colour[:, channel]
 

@@ -41,7 +41,7 @@ class Snapshot:
 
 
 def save_snapshot(
-    reconstruction: Reconstruction, directory: str, colour_map: str,
+    reconstruction: Reconstruction, directory: str,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Snapshot:
     """
@@ -50,7 +50,6 @@ def save_snapshot(
     Names are never used twice, since viewers keep a mesh by its name.
 
     :param directory: made when needed; ~ is the home
-    :param colour_map: one of the choices of Settings.colour_map
     :param interrupted: asked all the while; True: leave no file and raise
     :raises InputError: if there is nothing to save yet
     :raises Gr2tError: if the file cannot be written, or the writing was interrupted
@@ -78,7 +77,7 @@ def save_snapshot(
     expected = sum(
         int(np.count_nonzero(keyframe.rays.converged)) for keyframe in reconstruction.keyframes)
     file = write_views(
-        new_path(Path(directory).expanduser()), meshes, reconstruction.colour_scale(), colour_map,
+        new_path(Path(directory).expanduser()), meshes, reconstruction.colouring(),
         expected_vertices=expected)
     low, high = zip(*ranges) if ranges else ((0.0,), (0.0,))
     return Snapshot(file, (min(low), max(high)))

@@ -16,7 +16,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import PointCloud2, PointField
 from visualization_msgs.msg import MarkerArray
 
-from ..core.colour import colours
+from ..core.colour import Colouring
 from ..core.reconstruction import Reconstruction
 from ..core.shading import triangle_corners
 from ..core.view_mesh import ViewMesh
@@ -47,7 +47,7 @@ class MapPublishers:
     all of them where someone new listens. Nothing is computed while nobody does.
 
     :param node: on which to advertise
-    :param settings: display_stride, colour_map and shading count
+    :param settings: display_stride and shading count
     :param timings: learns how long things take
     """
 
@@ -63,7 +63,7 @@ class MapPublishers:
         self._listeners = {self._mesh: 0, self._points: 0, self._edges: 0}
         self._waiting: dict[int, None] = {}  # keyframes, in order
         self._clouds: dict[int, NDArray[np.void]] = {}  # of each keyframe; see cloud
-        self._scale = 0.0
+        self._shown = 0.0  # what the scale of the last colours stood for
 
     def update(self, settings: Settings) -> None:
         """Take parameters that may change."""
@@ -95,44 +95,44 @@ class MapPublishers:
             return sent
         if not self._waiting:
             return sent
-        scale = reconstruction.colour_scale()
+        colouring = reconstruction.colouring()
         # likelihoods are shares of the number of views; what they are shares of is compared
-        if abs(views * scale - self._scale) > _NEW_COLOURS * self._scale:
-            self._scale = views * scale
+        shown = colouring.scale * (views if colouring.by == 'likelihood' else 1)
+        if abs(shown - self._shown) > _NEW_COLOURS * self._shown:
+            self._shown = shown
             self._waiting.update(everything)
         with self._timings.measure('mesh'):
             meshes = self._take(reconstruction)
         with self._timings.measure('publish', cpu=True):
-            self._send(meshes, frame_id, stamp_ns, views, scale)
+            self._send(meshes, frame_id, stamp_ns, views, colouring)
         return True
 
     def _send(
-        self, meshes: dict[int, ViewMesh], frame_id: str, stamp_ns: int, views: int, scale: float
+        self, meshes: dict[int, ViewMesh], frame_id: str, stamp_ns: int, views: int,
+        colouring: Colouring,
     ) -> None:
         if self._listeners[self._mesh]:
             self._mesh.publish(marker_array(frame_id, NAMESPACE, [
-                triangles(
-                    keyframe, mesh, scale, self._settings.colour_map, self._settings.shading)
+                triangles(keyframe, mesh, colouring, self._settings.shading)
                 for keyframe, mesh in meshes.items()]))
         if self._listeners[self._edges]:
             self._edges.publish(marker_array(frame_id, EDGES, [
-                lines(keyframe, mesh, scale, self._settings.colour_map)
+                lines(keyframe, mesh, colouring)
                 for keyframe, mesh in meshes.items()]))
         if self._listeners[self._points]:
             self._clouds.update(
                 (keyframe, cloud(mesh, views)) for keyframe, mesh in meshes.items())
-            message = point_cloud(
-                [*self._clouds.values()], views, scale, self._settings.colour_map)
-            self._send_points(message, frame_id, stamp_ns)
+            self._send_points(
+                point_cloud([*self._clouds.values()], views, colouring), frame_id, stamp_ns)
 
     def clear(self, frame_id: str) -> None:
         """Take back all that was sent, also from those who come late."""
         self._waiting.clear()
         self._clouds.clear()
-        self._scale = 0.0
+        self._shown = 0.0
         self._mesh.publish(no_markers(frame_id, NAMESPACE))
         self._edges.publish(no_markers(frame_id, EDGES))
-        self._send_points(point_cloud([], 0, 0.0, self._settings.colour_map), frame_id, 0)
+        self._send_points(point_cloud([], 0, Colouring('', 0.0, 'turbo')), frame_id, 0)
 
     def _appeared(self, publisher: Publisher) -> bool:
         before = self._listeners[publisher]
@@ -164,24 +164,22 @@ def outputs_profile(depth: int) -> QoSProfile:
         durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def triangles(
-    marker: int, mesh: ViewMesh, scale: float, colour_map: str, shading: bool
-) -> Marker:
+def triangles(marker: int, mesh: ViewMesh, colouring: Colouring, shading: bool) -> Marker:
     """
     Return a mesh as a marker has it: each triangle's three corners written out.
 
     :param shading: whether faces turned away from a light of the world are darker: viewers do not
         light what has colours of its own, and without it no shape is seen
     """
-    colour = colours(mesh.vertex_likelihood, scale, colour_map)
+    colour = colouring.colours(mesh.vertex_likelihood, mesh.vertex_sigma)
     return Marker(marker, *triangle_corners(mesh.vertices, mesh.faces, colour, shading))
 
 
-def lines(marker: int, mesh: ViewMesh, scale: float, colour_map: str) -> Marker:
+def lines(marker: int, mesh: ViewMesh, colouring: Colouring) -> Marker:
     """Return a mesh's edges as a marker has them."""
     points = mesh.vertices[mesh.edges.reshape(-1)]
     lengths = np.linalg.norm(points[1::2] - points[::2], axis=1)
-    colour = colours(mesh.edge_likelihood, scale, colour_map)
+    colour = colouring.edge_colours(mesh.edge_likelihood, mesh.vertex_sigma, mesh.edges)
     width = _LINE * float(np.median(lengths)) if len(lengths) else 1.0
     return Marker(marker, points, np.repeat(colour, 2, axis=0), width)
 
@@ -203,19 +201,19 @@ def cloud(mesh: ViewMesh, views: int) -> NDArray[np.void]:
 
 
 def point_cloud(
-    clouds: Sequence[NDArray[np.void]], views: int, scale: float, colour_map: str
+    clouds: Sequence[NDArray[np.void]], views: int, colouring: Colouring
 ) -> PointCloud2:
     """
     Return points as a message without header: x, y, z, rgb, likelihood, sigma, confidence.
 
     :param clouds: of `cloud`
     :param views: in the map
-    :param scale: the likelihood that gets the last colour
+    :param colouring: of rgb
     """
     points = np.concatenate([np.zeros(0, _POINT), *clouds])
     points = np.ascontiguousarray(points[::len(points) // MAX_POINTS + 1])
     points['likelihood'] /= max(views, 1)
-    rgb = colours(points['likelihood'], scale, colour_map).astype(np.uint32)
+    rgb = colouring.colours(points['likelihood'], points['sigma']).astype(np.uint32)
     points['rgb'] = rgb @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     message = PointCloud2()
     message.height = 1

@@ -331,8 +331,7 @@ class Worker:
     ) -> Snapshot:
         with self.timings.measure('snapshot'):
             return save_snapshot(
-                reconstruction, self._settings.snapshot_directory, self._settings.colour_map,
-                interrupted)
+                reconstruction, self._settings.snapshot_directory, interrupted)
 
     def _reset(self) -> None:
         for view in self._views:

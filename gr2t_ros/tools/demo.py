@@ -23,7 +23,8 @@ from typing import Any, NoReturn, TypeVar
 import numpy as np
 import trimesh
 
-from ..core.view_mesh import ViewMesh
+from ..core.colour import Colouring
+from ..core.view_mesh import ROBUST_MAXIMUM, ViewMesh
 from ..errors import Gr2tError, InputError
 from ..io.ply import read
 from ..ros.client import Client
@@ -181,11 +182,14 @@ class _Demo:
     def _measure(self, scene: trimesh.Trimesh) -> tuple[ViewMesh, np.ndarray]:
         """Draw the mesh; return it and its vertices' distances to the true surface, metres."""
         mesh = read(self._mesh).mesh
-        scale = float(np.percentile(mesh.vertex_likelihood, 98))
+        settings = Settings()
+        colouring = Colouring(
+            settings.color_by, float(np.percentile(mesh.vertex_likelihood, ROBUST_MAXIMUM)),
+            settings.colour_map)
         distance = Surface(scene.triangles).distances(mesh.vertices)
         preview(
-            self._picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, scale,
-            Settings().colour_map, title='gr2t_ros: a simulated tabletop, mapped live',
+            self._picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, mesh.vertex_sigma,
+            colouring, title='gr2t_ros: a simulated tabletop, mapped live',
             poses=self._poses)
         return mesh, distance
 

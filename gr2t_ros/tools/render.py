@@ -1,9 +1,10 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of meshes in the colours of their likelihoods."""
+"""Pictures of meshes in the colours of their likelihoods or deviations."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ from matplotlib.figure import Figure
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..core.colour import colours as likelihood_colours
+from ..core.colour import Colouring
 from ..io.files import whole_file
 from .raster import Raster, rasterise, vertex_normals
 from .viewpoint import good_view
@@ -36,22 +37,22 @@ def preview(
     vertices: ArrayLike,
     faces: ArrayLike,
     likelihood: ArrayLike,
-    scale: float,
-    colour_map: str,
+    sigma: ArrayLike,
+    colouring: Colouring,
     title: str = '',
     poses: Sequence[Pose] = (),
     width: int = 1280,
     height: int = 800,
 ) -> None:
     """
-    Write a picture of a mesh, from a place that shows much of it, with a scale of likelihoods.
+    Write a picture of a mesh, from a place that shows much of it, with a scale of colours.
 
     :param path: a PNG file; an older one is replaced
     :param vertices: (n, 3) world, metres
     :param faces: (m, 3) indices of vertices, counter-clockwise seen from outside
     :param likelihood: (n,), 1 / (px^2 m)
-    :param scale: the likelihood that gets the last colour
-    :param colour_map: one of the choices of Settings.colour_map
+    :param sigma: (n,) standard deviations, metres
+    :param colouring: which of the two is shown
     :param title: a line below the picture
     :param poses: (4, 4) T_world_camera of the cameras that scanned it; without them z is up
     :param width: of the picture, pixels; likewise height, to which a footer is added
@@ -63,18 +64,17 @@ def preview(
     used = np.zeros(len(vertices), bool)
     used[faces] = True
     faces = (np.cumsum(used, dtype=np.int32) - 1)[faces]
-    vertices, likelihood = vertices[used], np.asarray(likelihood)[used]
+    vertices = vertices[used]
+    colours = colouring.colours(np.asarray(likelihood)[used], np.asarray(sigma)[used])
     T_world_camera = good_view(vertices, faces, poses, _FOCAL, height / width)
-    picture = render(
-        vertices, faces, likelihood_colours(likelihood, scale, colour_map), T_world_camera,
-        width, height)
-    figure = _framed(picture, scale, colour_map, title)
+    picture = render(vertices, faces, colours, T_world_camera, width, height)
+    figure = _framed(picture, colouring, title)
     with whole_file(path) as stream:
         figure.savefig(stream, format='png')
 
 
-def _framed(picture: Image, scale: float, colour_map: str, title: str) -> Figure:
-    """Return the picture above a footer with a title and a scale of likelihoods."""
+def _framed(picture: Image, colouring: Colouring, title: str) -> Figure:
+    """Return the picture above a footer with a title and a scale of colours."""
     height, width = picture.shape[0] + _FOOTER, picture.shape[1]
     footer = np.broadcast_to(_BOTTOM.astype(np.uint8), (_FOOTER, width, 3))
     figure = Figure(figsize=(width / _DPI, height / _DPI), dpi=_DPI)
@@ -83,18 +83,28 @@ def _framed(picture: Image, scale: float, colour_map: str, title: str) -> Figure
     figure.text(
         24 / width, 0.5 * _FOOTER / height, title, color=_INK, fontsize=11, va='center')
     bar = figure.add_axes((1 - 384 / width, 38 / height, 360 / width, 14 / height))
-    # likelihoods are far from 1: a power of ten in the label keeps the ticks short
-    exponent = int(np.floor(np.log10(scale))) if scale > 0 else 0
+    label, factor = _unit(colouring)
+    end = colouring.scale or 1.0
+    ramp = np.linspace(0.0, end, 256)
     bar.imshow(
-        likelihood_colours(np.linspace(0, 1, 256), 1.0, colour_map)[None], aspect='auto',
-        extent=(0.0, scale / 10.0 ** exponent if scale > 0 else 1.0, 0.0, 1.0))
+        replace(colouring, scale=end).colours(ramp, ramp)[None], aspect='auto',
+        extent=(0.0, factor * end, 0.0, 1.0))
     bar.set_yticks([])
     bar.locator_params(axis='x', nbins=6)
     bar.tick_params(axis='x', colors=_INK, labelsize=9, length=3, pad=2)
     bar.spines[:].set_visible(False)
-    unit = f'$10^{{{exponent}}}$ / (px² m)' if exponent else '1 / (px² m)'
-    bar.set_title(f'likelihood, {unit}', color=_INK, fontsize=9, pad=4, loc='left')
+    bar.set_title(label, color=_INK, fontsize=9, pad=4, loc='left')
     return figure
+
+
+def _unit(colouring: Colouring) -> tuple[str, float]:
+    """Return the label of a scale, and by what its values are multiplied."""
+    if colouring.by == 'sigma':
+        return 'standard deviation along the ray, mm', 1e3
+    # likelihoods are far from 1: a power of ten in the label keeps the ticks short
+    exponent = int(np.floor(np.log10(colouring.scale))) if colouring.scale > 0 else 0
+    unit = f'$10^{{{exponent}}}$' if exponent else '1'
+    return f'likelihood, {unit} / (px² m)', 10.0 ** -exponent
 
 
 def render(

@@ -34,7 +34,7 @@ def write_results(
     say(f'writing {directory} ...')
     meshes = _Meshes(reconstruction, run, directory / 'views' if per_view else None)
     written = ply.write_views(
-        directory / 'mesh.ply', meshes.all, meshes.scale, run.settings.colour_map,
+        directory / 'mesh.ply', meshes.all, meshes.colouring,
         expected_vertices=meshes.expected)
     counts = {'vertices': written.vertices, 'edges': written.edges, 'faces': written.faces}
     results = {str(written.path): ', '.join(f'{n} {name}' for name, n in counts.items())}
@@ -48,8 +48,8 @@ def write_results(
     mesh = ply.read(written.path).mesh
     picture = directory / 'preview.png'
     preview(
-        picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, meshes.scale,
-        run.settings.colour_map, title=title,
+        picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, mesh.vertex_sigma,
+        meshes.colouring, title=title,
         poses=[item.view.T_world_camera for item in reconstruction.keyframes])
     results[str(picture)] = ''
     run.finish_seconds += perf_counter() - begin
@@ -65,7 +65,7 @@ class _Meshes:
     def __init__(
         self, reconstruction: Reconstruction, run: report.Run, views: Path | None
     ) -> None:
-        self.scale = reconstruction.colour_scale()
+        self.colouring = reconstruction.colouring()
         self.expected = sum(
             int(np.count_nonzero(item.rays.converged)) for item in reconstruction.keyframes)
         self._reconstruction = reconstruction
@@ -98,6 +98,5 @@ class _Meshes:
             return [(number, mesh if stride == 1 else self._reconstruction.mesh(number, stride))]
         if self._views is not None:
             ply.write_views(
-                self._views / f'view_{number:04d}.ply', strided, self.scale,
-                self._run.settings.colour_map)
+                self._views / f'view_{number:04d}.ply', strided, self.colouring)
             self._written.add(number)
