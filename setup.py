@@ -52,11 +52,13 @@ setup(
         'kilted': [f'ros-kilted-{name}' for name in ROS_PACKAGES],
         'jazzy': [f'ros-jazzy-{name}' for name in ROS_PACKAGES],
         'simulation': ['embreex>=2.17'],
+        'decimation': ['fast-simplification>=0.1.5'],
         # colcon test runs pytest because it is named in this one.
         'test': TEST_PACKAGES,
         'dev': [
             *TEST_PACKAGES,
             'colcon-common-extensions>=0.3',
+            'fast-simplification>=0.1.5',
             'mypy>=1.11',
             'ruff>=0.6',
             'types-PyYAML',

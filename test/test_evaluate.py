@@ -15,7 +15,7 @@ from gr2t_ros.errors import InputError
 from gr2t_ros.io import ply
 from gr2t_ros.tools import cli
 from gr2t_ros.tools.distance import Surface
-from gr2t_ros.tools.evaluate import confidence_curve, evaluate, likelihoods, nause
+from gr2t_ros.tools.evaluate import confidence_curve, evaluate, nause
 from gr2t_ros.tools.scenes import tabletop
 from gr2t_ros.tools.simulate import load_mesh
 
@@ -123,7 +123,8 @@ def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):
     colouring = Colouring('likelihood', 1.0, 'turbo')
     ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], colouring)
     ball.export(tmp_path / 'truth.stl')
-    assert len(likelihoods(load_mesh(tmp_path / 'mesh.ply'))) == len(ball.vertices)
+    likelihood = load_mesh(tmp_path / 'mesh.ply').vertex_attributes['likelihood']
+    assert len(likelihood) == len(ball.vertices)
     files = [str(tmp_path / 'mesh.ply'), str(tmp_path / 'truth.stl')]
     assert cli.main(['evaluate', *files, '--json', '--threshold', '0.001']) == 0
     result = json.loads(capsys.readouterr().out)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import trimesh
 
 from gr2t_ros.errors import InputError
+from gr2t_ros.io import trajectory
 from gr2t_ros.tools import cli
 from gr2t_ros.tools.noise import Noise
 from gr2t_ros.tools.orbit import looking_at, orbit
@@ -19,7 +20,6 @@ from gr2t_ros.tools.recorder import record
 from gr2t_ros.tools.scenes import tabletop, tabletop_poses
 from gr2t_ros.tools.simulate import (
     fitting_distance,
-    read_trajectory,
     rendered_views,
     simulated_camera,
     simulated_views,
@@ -218,7 +218,7 @@ def test_the_command_records_along_a_trajectory(ball, tmp_path, capsys):
         numbers = *T_world_camera[:3, 3], *Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
         lines.append(' '.join([str(stamp), *(f'{number:.12f}' for number in numbers)]))
     (tmp_path / 'way.txt').write_text('\n'.join(lines))
-    stamps, read = read_trajectory(tmp_path / 'way.txt')
+    stamps, read = trajectory.read(tmp_path / 'way.txt')
     assert stamps == [10_500_000_000, 11_250_000_000]
     assert_allclose(read, poses, atol=1e-11)
     assert cli.main([
@@ -255,7 +255,7 @@ def test_without_a_distance_the_cameras_see_all_of_the_mesh(ball):
     ('seed', ['ball.ply', 'out', '--seed', '-1']),
     ('cannot read', ['ball.ply', 'out', '--trajectory', 'nothing.txt']),
     ('line 2', ['ball.ply', 'out', '--trajectory', 'bad.txt']),
-    ('increase', ['ball.ply', 'out', '--trajectory', 'back.txt']),
+    ('two poses have the same timestamp', ['ball.ply', 'out', '--trajectory', 'back.txt']),
     ('no poses', ['ball.ply', 'out', '--trajectory', 'empty.txt']),
     ('--trajectory', ['ball.ply', 'out', '--trajectory', 'back.txt', '--views', '3']),
 ])

@@ -8,7 +8,7 @@ structured arrays: plyfile writes lists row by row, which takes a minute for a m
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from math import ceil, sqrt
 from pathlib import Path
@@ -97,7 +97,9 @@ def write_views(
                 counts = _spool(
                     meshes(stride), colouring, max_faces, vertices, faces, edges)
                 if counts is not None:
-                    out.write(_header(*counts))
+                    out.write(_header(
+                        ('vertex', _VERTEX, counts[0]), ('face', _FACE, counts[1]),
+                        (_EDGE_ELEMENT, _EDGE, counts[2])))
                     for spool in (vertices, faces, edges):
                         spool.seek(0)
                         shutil.copyfileobj(spool, out, 1 << 20)
@@ -120,9 +122,7 @@ def _spool(
         vertex_rows['sigma'] = mesh.vertex_sigma
         vertex_rows['confidence'] = mesh.vertex_confidence
         vertex_rows['view'] = view
-        face_rows = np.empty(len(mesh.faces), _FACE_ROW)
-        face_rows['length'] = 3
-        face_rows['vertex_indices'] = mesh.faces + vertex_count
+        face_rows = _face_rows(mesh.faces + vertex_count)
         edge_rows = np.empty(len(mesh.edges), _EDGE)
         edge_rows['vertex1'] = mesh.edges[:, 0] + vertex_count
         edge_rows['vertex2'] = mesh.edges[:, 1] + vertex_count
@@ -145,13 +145,54 @@ def _colour(rows: NDArray[Any], colour: NDArray[np.uint8]) -> None:
         rows[name] = colour[:, channel]
 
 
-def _header(vertices: int, faces: int, edges: int) -> bytes:
-    elements = [
+def write_surface(
+    path: Path,
+    vertices: NDArray[np.float64],
+    faces: NDArray[np.integer[Any]],
+    colours: NDArray[np.uint8] | None,
+    attributes: Mapping[str, NDArray[Any]],
+) -> None:
+    """
+    Write one mesh without edges.
+
+    :param vertices: (n, 3) world, metres
+    :param faces: (m, 3) indices of vertices
+    :param colours: (n, 3) red green blue
+    :param attributes: name -> (n,), float32 or int32 in the file
+    :raises Gr2tError: if the file cannot be written; an older one is left as it was
+    """
+    dtype = np.dtype([
+        *_VERTEX.descr[:3], *(() if colours is None else _COLOUR),
+        *((name, '<f4' if values.dtype.kind == 'f' else '<i4')
+          for name, values in attributes.items())])
+    rows = np.empty(len(vertices), dtype)
+    for axis, name in enumerate('xyz'):
+        rows[name] = vertices[:, axis]
+    if colours is not None:
+        for channel, (name, _) in enumerate(_COLOUR):
+            rows[name] = colours[:, channel]
+    for name, values in attributes.items():
+        rows[name] = values
+    with whole_file(path) as out:
+        out.write(_header(('vertex', dtype, len(rows)), ('face', _FACE, len(faces))))
+        out.write(rows.data)
+        out.write(_face_rows(faces).data)
+
+
+def _face_rows(faces: NDArray[np.integer[Any]]) -> NDArray[Any]:
+    rows = np.empty(len(faces), _FACE_ROW)
+    rows['length'] = 3
+    rows['vertex_indices'] = faces
+    return rows
+
+
+def _header(*elements: tuple[str, np.dtype[Any], int]) -> bytes:
+    """Return the header for elements: name, type of a row, number of rows."""
+    described = [
         # a row that stands for all of them: a header needs their number only
         PlyElement.describe(np.broadcast_to(np.zeros((), dtype), count), name)
-        for name, dtype, count in (
-            ('vertex', _VERTEX, vertices), ('face', _FACE, faces), (_EDGE_ELEMENT, _EDGE, edges))]
-    text: str = PlyData(elements, byte_order='<', comments=[
+        for name, dtype, count in elements]
+    text: str = PlyData(described, byte_order='<', comments=[
         'gr2t_ros; metres; likelihood in 1 / (px^2 m); confidence 0 to 1']).header
     return f'{text}\n'.encode('ascii')
 

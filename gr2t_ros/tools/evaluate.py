@@ -90,7 +90,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     mesh, reference = load_mesh(args.mesh), load_mesh(args.reference)
     thresholds = tuple(sorted(set(args.threshold or THRESHOLDS)))
-    result = evaluate(mesh, reference, likelihoods(mesh), thresholds)
+    result = evaluate(
+        mesh, reference, mesh.vertex_attributes.get('likelihood'), thresholds)
     print(json.dumps(asdict(result), indent=2) if args.json else table(result))
     return 0
 
@@ -175,16 +176,6 @@ def nause(distance: ArrayLike, score: ArrayLike) -> float:
     if random == oracle:
         return 0.0
     return (area(np.argsort(-ranks, kind='stable')) - oracle) / (random - oracle)
-
-
-def likelihoods(mesh: trimesh.Trimesh) -> NDArray[np.float64] | None:
-    """Return the vertices' property `likelihood` of a PLY file, (n,); None if there is none."""
-    vertex = mesh.metadata.get('_ply_raw', {}).get('vertex', {}).get('data')
-    try:
-        likelihood = np.asarray(vertex['likelihood'], np.float64).reshape(-1)
-    except (KeyError, TypeError, ValueError):
-        return None
-    return likelihood if len(likelihood) == len(mesh.vertices) else None
 
 
 def table(result: Evaluation) -> str:

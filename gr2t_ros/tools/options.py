@@ -47,6 +47,13 @@ def settings(args: argparse.Namespace) -> Settings:
     return result.updated(_parameters(args.parameters))
 
 
+def count(text: str) -> int:
+    """Return a number of at least 1, as argparse wants to be told of others."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, not {text}')
+    return int(text)
+
+
 def _preset(name: str) -> Path:
     folder = share_directory() / 'config'
     names = sorted(path.stem for path in folder.glob('*.yaml'))

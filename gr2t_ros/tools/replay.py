@@ -48,7 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_topic_arguments(parser)
     parser.add_argument('--world-frame', metavar='FRAME', help='as the parameter world_frame')
     parser.add_argument(
-        '--max-frames', metavar='N', type=_count, help='stop after N frames')
+        '--max-frames', metavar='N', type=options.count, help='stop after N frames')
     parser.add_argument(
         '--start', metavar='S', type=_seconds, default=0.0,
         help='skip the first S seconds')
@@ -271,12 +271,6 @@ def _parameters(settings: Settings) -> str:
               for name, value in asdict(settings).items() if name not in _LIVE]
     return textwrap.fill(
         ' '.join(values), 99, initial_indent='  parameters   ', subsequent_indent=' ' * 15)
-
-
-def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f'must be a whole number of at least 1, not {text}')
-    return int(text)
 
 
 def _seconds(text: str) -> float:

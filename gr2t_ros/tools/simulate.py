@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 import trimesh
 
 from ..core.camera import Camera
 from ..core.view import View
 from ..errors import InputError
+from ..io import formats, trajectory
 from .noise import KINDS, Noise
 from .orbit import orbit, Pose
 from .progress import Progress
@@ -27,8 +27,6 @@ ENCODINGS = ('32FC1', '16UC1')
 _FOCAL_OF_WIDTH = 525.0 / 640.0
 _START_NS = 1_700_000_000_000_000_000
 _PERIOD_NS = 33_333_333
-
-_WORST_QUATERNION = 0.05  # a length that differs more from 1 is a mistake, not rounding
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -90,7 +88,9 @@ def run(args: argparse.Namespace) -> int:
     if args.trajectory:
         if args.views is not None or args.distance is not None:
             raise InputError('--trajectory has the poses: give it without --views and --distance')
-        stamps, poses = read_trajectory(args.trajectory)
+        stamps, poses = trajectory.read(args.trajectory)
+        if len(set(stamps)) < len(stamps):
+            raise InputError(f'{args.trajectory}: two poses have the same timestamp')
         way = f'along {args.trajectory}'
     else:
         distance, views = args.distance, 12 if args.views is None else args.views
@@ -126,64 +126,17 @@ def _watched(views: Iterable[View], progress: Progress) -> Iterator[View]:
 
 def load_mesh(path: Path) -> trimesh.Trimesh:
     """
-    Read a mesh of any format that trimesh reads; its coordinates stay.
+    Read a mesh as formats.read does.
 
     :param path: a file, or the name of one of SCENES
+    :return: with the file's attributes in vertex_attributes
     :raises InputError: if it cannot be read or has no triangles
     """
-    if not path.is_file():
-        if str(path) in SCENES:
-            return SCENES[str(path)].mesh()
-        raise InputError(f'there is no mesh {path}')
-    try:
-        mesh = trimesh.load_mesh(path, process=False)
-    except Exception as error:  # trimesh's readers raise whatever their libraries do
-        raise InputError(
-            f'{path} cannot be read as a mesh ({type(error).__name__}: {error})') from error
-    if not isinstance(mesh, trimesh.Trimesh) or len(mesh.faces) == 0:
-        raise InputError(f'{path} has no triangles')
-    if not np.isfinite(mesh.vertices).all():
-        raise InputError(f'{path} has vertices that are not finite')
-    return mesh
-
-
-def read_trajectory(path: Path) -> tuple[list[int], list[Pose]]:
-    """
-    Read camera poses in the TUM format.
-
-    :return: stamps in nanoseconds; (4, 4) T_world_camera each (optical frame)
-    :raises InputError: naming the file and the line that cannot be used
-    """
-    try:
-        lines = path.read_text(encoding='utf-8').splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f'cannot read the trajectory {path}: {error}') from error
-    stamps: list[int] = []
-    poses: list[Pose] = []
-    for number, line in enumerate(lines, 1):
-        words = line.partition('#')[0].split()
-        if not words:
-            continue
-        try:
-            stamp, x, y, z, *quaternion = (float(word) for word in words)
-        except ValueError:
-            quaternion = []
-        length = float(np.linalg.norm(quaternion))
-        if (len(quaternion) != 4 or not np.isfinite((stamp, x, y, z)).all()
-                or not abs(length - 1.0) < _WORST_QUATERNION):
-            raise InputError(
-                f'{path}, line {number}: not "timestamp tx ty tz qx qy qz qw" with a unit '
-                'quaternion')
-        stamps.append(round(stamp * 1e9))
-        if stamps[-1] < 0 or (len(stamps) > 1 and stamps[-1] <= stamps[-2]):
-            raise InputError(f'{path}, line {number}: timestamps must be positive and increase')
-        T_world_camera = np.eye(4)
-        T_world_camera[:3, :3] = Rotation.from_quat(quaternion).as_matrix()
-        T_world_camera[:3, 3] = x, y, z
-        poses.append(T_world_camera)
-    if not poses:
-        raise InputError(f'{path} has no poses')
-    return stamps, poses
+    if not path.is_file() and str(path) in SCENES:
+        return SCENES[str(path)].mesh()
+    mesh = formats.read(path)
+    return trimesh.Trimesh(
+        mesh.vertices, mesh.faces, process=False, vertex_attributes={**mesh.attributes})
 
 
 def fitting_distance(mesh: trimesh.Trimesh, camera: Camera) -> float:
