@@ -88,6 +88,23 @@ def with_keys(
         blocks = _grown(blocks._replace(size=size))
 
 
+def capacity_for(size: int) -> int:
+    """Return what new_blocks may be asked for to hold a number of blocks."""
+    return 1 << max(size - 1, 1023).bit_length()
+
+
+def linked(blocks: Blocks, size: int) -> Blocks:
+    """
+    Return the lattice with the hash and the neighbours of blocks whose keys were filled in.
+
+    :param blocks: of new_blocks
+    :param size: number of blocks, block 0 included
+    """
+    _rehash(blocks.table_key, blocks.table_block, blocks.key, size)
+    _link_all(blocks, size)
+    return blocks._replace(size=size)
+
+
 def _grown(blocks: Blocks) -> Blocks:
     grown = new_blocks(2 * len(blocks.key))
     for name in blocks._fields[3:]:
@@ -188,6 +205,12 @@ def _link(blocks: Blocks, block: int) -> None:
         if other != 0:
             blocks.neighbour[block, n] = other
             blocks.neighbour[other, 26 - n] = block
+
+
+@njit(cache=True, nogil=True)
+def _link_all(blocks: Blocks, size: int) -> None:
+    for block in range(1, size):
+        _link(blocks, block)
 
 
 @njit(cache=True, nogil=True)

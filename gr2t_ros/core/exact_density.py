@@ -10,6 +10,7 @@ view does not change; ExactDensity puts it in.
 """
 from __future__ import annotations
 
+from collections.abc import Mapping
 from concurrent.futures import Executor
 from math import ceil, pi, sqrt
 from typing import Any, NamedTuple
@@ -136,20 +137,17 @@ class ExactDensity:
     def add(self, view: View, pool: Executor | None = None) -> None:
         """Add a view's kernels."""
         width, height = view.camera.width, view.camera.height
-        before = ceil(2 * self.window.reach)
-        stride = width + before + self.window.lanes
-        depth = np.full((height + before + self.window.lanes, stride), INVALID_DEPTH)
+        stride, before, cells_wide, rows, cells_high = self._padding(width, height)
+        depth = np.full((rows, stride), INVALID_DEPTH)
         inside = (slice(before, before + height), slice(before, before + width))
         seen = np.isfinite(view.depth) & np.isfinite(view.camera.rays[..., 0])
         depth[inside] = np.where(seen, view.depth, INVALID_DEPTH)
         precision = np.zeros_like(depth)
         precision[inside] = RESIDUAL_SCALE / self.h3(np.where(seen, view.depth, 0))
 
-        reach = ceil(self.window.reach)
-        cells_wide = (width + 2 * reach) // _CELL + 1
         near, far = _depth_ranges(
-            depth, precision, before, reach, self.truncation * RESIDUAL_SCALE,
-            (height + 2 * reach) // _CELL + 1, cells_wide)
+            depth, precision, before, ceil(self.window.reach), self.truncation * RESIDUAL_SCALE,
+            cells_high, cells_wide)
 
         T_world_camera = np.asarray(view.T_world_camera, np.float64)
         R_camera_world = T_world_camera[:3, :3].T
@@ -177,6 +175,42 @@ class ExactDensity:
 
     def refresh(self, pool: Executor | None = None) -> None:
         """Do nothing: the sum is always up to date."""
+
+    @property
+    def used(self) -> dict[str, int]:
+        """Return how much of each of the arrays of Views is in use."""
+        return {
+            **dict.fromkeys(('T_camera_world', 'camera', 'layout', 'factor'), self._views.size),
+            **dict.fromkeys(('depth', 'precision'), self._pixels),
+            **dict.fromkeys(('near', 'far'), self._cells)}
+
+    def restore(self, views: int, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """
+        Become what another density was when its arrays were saved.
+
+        :param arrays: of Views, as far as they are in use
+        :raises ValueError: if they do not fit each other
+        """
+        self._views = Views(views, **arrays)
+        self._pixels, self._cells = len(arrays['depth']), len(arrays['near'])
+        if {name: len(array) for name, array in arrays.items()} != self.used:
+            raise ValueError('sizes of the views')
+        pixels, cells = 0, 0
+        for pixel, stride, cell, cells_wide, before, width, height in arrays['layout'].tolist():
+            expected = self._padding(width, height)
+            if width < 1 or height < 1 or (
+                    pixel, cell, stride, before, cells_wide) != (pixels, cells, *expected[:3]):
+                raise ValueError('layout of the views')
+            pixels, cells = pixels + expected[3] * stride, cells + expected[4] * cells_wide
+        if (pixels, cells) != (self._pixels, self._cells):
+            raise ValueError('layout of the views')
+
+    def _padding(self, width: int, height: int) -> tuple[int, int, int, int, int]:
+        """Return an image's row stride, padding, cells in a row, padded rows, rows of cells."""
+        before, reach = ceil(2 * self.window.reach), ceil(self.window.reach)
+        return (
+            width + before + self.window.lanes, before, (width + 2 * reach) // _CELL + 1,
+            height + before + self.window.lanes, (height + 2 * reach) // _CELL + 1)
 
     def likelihood(self, points: Doubles, pool: Executor | None = None) -> Doubles:
         """

@@ -8,7 +8,7 @@ those climb again to their maximum, and the meshes of their keyframes follow.
 """
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError
 from ..settings import Settings
-from .blocks import new_blocks, with_keys
+from .blocks import linked, new_blocks, with_keys
 from .camera import Camera
 from .colour import Colouring
 from .confidence import deviations
 from .exact_density import ExactDensity
-from .frozen import frozen, Room
+from .frozen import ASKING, frozen, Room
 from .poses import step
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .shading import triangle_corners
@@ -92,12 +92,14 @@ class Reconstruction:
 
     :param settings: bandwidths, thresholds, keyframe distances, threads
 
-    `keyframes` are the views that own a mesh, `density` is what all views built.
+    `keyframes` are the views that own a mesh, `density` is what all views built, `stamp_ns` is the
+    newest stamp of these views.
     """
 
     def __init__(self, settings: Settings) -> None:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
+        self.stamp_ns = 0
         self._density: Density | None = None
         self._noticed: set[str] = set()
         self._pool: Executor | None = ThreadPoolExecutor(
@@ -113,6 +115,11 @@ class Reconstruction:
         if self._density is None:
             raise FrameError('empty_map', 'there is no map yet: no frame was integrated')
         return self._density
+
+    @property
+    def pool(self) -> Executor | None:
+        """Return the threads; None: it works in the caller's."""
+        return self._pool
 
     @property
     def blocks(self) -> int:
@@ -146,6 +153,7 @@ class Reconstruction:
             self._density, notice = self._new_density(view)
             notices += [notice] if notice else []
         self._density.add(view, self._pool)
+        self.stamp_ns = max(self.stamp_ns, view.stamp_ns)
         notices += self._notice_aliasing(view)
         wanted = self._is_keyframe(view)
         number = None
@@ -212,23 +220,28 @@ class Reconstruction:
         sigma = np.concatenate(samples)
         return sigma[np.isfinite(sigma)]
 
-    def frozen(self, room: Room) -> Reconstruction:
+    def frozen(self, room: Room, fields: Sequence[str] = ASKING) -> Reconstruction:
         """
         Return the map as it is now, for another thread, while this one goes on.
 
         It can finish and be meshed, in that thread alone, and takes no views.
 
         :param room: of frozen.room_for; most of the memory that it takes
+        :param fields: of the lattice that it has; with state.ADDING it can be saved, not meshed
         """
         twin = copy(self)
         twin._pool = None
         if self._density is not None:
             self._density.refresh(self._pool)
-            twin._density = frozen(self._density, room)
+            twin._density = frozen(self._density, room, fields)
         for keyframe in self.keyframes:
             keyframe.shared = True
         twin.keyframes = [copy(keyframe) for keyframe in self.keyframes]
         return twin
+
+    def restore(self, density: Density, keyframes: list[Keyframe], stamp_ns: int) -> None:
+        """Become what another reconstruction was when it was saved; see state.py."""
+        self._density, self.keyframes, self.stamp_ns = density, keyframes, stamp_ns
 
     def close(self) -> None:
         """End the threads."""
@@ -375,4 +388,5 @@ def warm_up(settings: Settings) -> float:
             mesh.vertices, mesh.faces, np.zeros(mesh.vertices.shape, np.uint8), shading=True)
     tiny.close()
     with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
+    linked(new_blocks(1), 1)
     return perf_counter() - began

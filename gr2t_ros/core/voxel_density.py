@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
 from . import blocks as lattice
-from .blocks import SIDE
+from .blocks import Blocks, SIDE
 from .camera import Camera
 from .compiled import run_all
 from .view import View
@@ -128,7 +128,25 @@ class VoxelDensity:
             return
         changed = np.unique(np.concatenate(self._stale))
         self._stale.clear()
-        chosen = np.sort(lattice.with_neighbours(self.blocks, changed, self._change))
+        self._filter(
+            np.sort(lattice.with_neighbours(self.blocks, changed, self._change)), pool)
+
+    def restore(
+        self, blocks: Blocks, views: int, pixels: int, aliased_pixels: int, change: int,
+        pool: Executor | None = None,
+    ) -> None:
+        """
+        Become what another density was when its samples were saved, just refreshed.
+
+        :param blocks: with all but the coefficients
+        """
+        self.blocks = blocks
+        self.size, self.pixels, self.aliased_pixels = views, pixels, aliased_pixels
+        self._change = change
+        self._filter(np.arange(1, blocks.size, dtype=np.int32), pool)
+
+    def _filter(self, chosen: NDArray[np.int32], pool: Executor | None) -> None:
+        """Compute the spline of some blocks."""
         parts = [chosen[i:i + _BLOCKS] for i in range(0, len(chosen), _BLOCKS)]
         run_all(pool, lattice.prefilter, [(self.blocks, part) for part in parts])
         run_all(pool, lattice.copy_margins, [(self.blocks, part) for part in parts])
