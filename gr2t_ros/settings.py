@@ -92,12 +92,19 @@ class Settings:
         0.17, 'A frame turned this far from the last keyframe becomes one.',
         unit='rad', low=0.0, high=3.15, live=True)
     max_keyframes: int = _parameter(
-        1000, 'Keyframes kept; later ones still add to the density (reported).',
+        1000, 'Keyframes kept. Beyond, those too far away to see what the camera sees are '
+        'written out, as with max_memory_mb; where there are none, later ones add to the density '
+        'only (reported).',
         low=1, high=1_000_000, live=True)
     remarch_budget: float = _parameter(
         0.02, 'Time per frame for marching older rays again, less while images wait in the '
         'node\'s queue; what is left is done when there is time, before a snapshot or at the end.',
         unit='s', low=0.0, high=60.0, live=True)
+    max_memory_mb: int = _parameter(
+        0, 'Memory of the map (10^6 bytes): blocks, rays and the copy for a snapshot; the process '
+        'takes about 600 MB besides. Where it is full, the keyframes farthest from the camera are '
+        'written out as finished PLY files and forgotten. 0: half of the machine\'s memory.',
+        unit='MB', low=0, high=10_000_000, live=True)
     threads: int = _parameter(
         0, 'Threads that march rays; 0: one per core.', low=0, high=1024)
 

@@ -8,6 +8,7 @@ whole, so no position is ever rounded. Block 0 is empty and stands for all that 
 """
 from __future__ import annotations
 
+import mmap
 from typing import Any, NamedTuple
 
 from numba import int64, njit, uint64
@@ -23,6 +24,8 @@ SIDE = 8  # voxels
 VOXELS = SIDE ** 3
 COEFFICIENTS = SIDE * SIDE * ROW
 BYTES_PER_BLOCK = 2 * 4 * VOXELS + 4 * COEFFICIENTS + 8 + 27 * 4 + 2 * 4
+NO_LIMIT = 1 << 40  # blocks
+_LAST_STEP = 16
 _BITS = 21  # of a block's number on each axis: 2 million blocks either way
 _OFFSET = 1 << (_BITS - 1)
 _MASK = (1 << _BITS) - 1
@@ -60,23 +63,30 @@ class Blocks(NamedTuple):
 
 def new_blocks(capacity: int = 1024) -> Blocks:
     """Return a lattice that holds block 0 only."""
-    table = 4 * capacity
+    table = 1 << (4 * capacity - 1).bit_length()
     return Blocks(
         1, np.zeros(table, np.int64), np.zeros(table, np.int32), np.full(capacity, -1, np.int64),
-        np.zeros(capacity * VOXELS, np.float32), np.zeros(capacity * VOXELS, np.float32),
-        np.zeros(capacity * COEFFICIENTS, np.float32),
+        _room(capacity * VOXELS), _room(capacity * VOXELS), _room(capacity * COEFFICIENTS),
         np.zeros((capacity, 27), np.int32), np.zeros(capacity, np.int32),
         np.zeros(capacity, np.int32))
 
 
+def _room(count: int) -> Floats:
+    """Return zeros in pages of their own, so that a part can be given back; see block_removal."""
+    return np.frombuffer(
+        mmap.mmap(-1, 4 * count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS), np.float32)
+
+
 def with_keys(
-    blocks: Blocks, keys: NDArray[np.int64], change: int
+    blocks: Blocks, keys: NDArray[np.int64], change: int, most: int = NO_LIMIT
 ) -> tuple[Blocks, NDArray[np.int32]]:
     """
     Make sure that blocks exist, growing by doubling, and mark them as changed.
 
     :param keys: (n,) int64, in any order, repeated or not
     :param change: the number of the change, greater than all before
+    :param most: where no more blocks than this are expected, the last doublings are one step: a
+        lattice that grows is there twice, and what is reserved takes no memory before it is used
     :return: the lattice and the blocks' numbers, each once, in the order of the keys
     """
     found = np.zeros(len(keys), np.int32)
@@ -85,7 +95,10 @@ def with_keys(
         size, count, done = _insert(blocks, size, keys, done, change, found, count)
         if done == len(keys):
             return blocks._replace(size=size), found[:count].copy()
-        blocks = _grown(blocks._replace(size=size))
+        capacity = 2 * size
+        if size < most <= _LAST_STEP * size:
+            capacity = most
+        blocks = _grown(blocks._replace(size=size), capacity)
 
 
 def capacity_for(size: int) -> int:
@@ -105,8 +118,8 @@ def linked(blocks: Blocks, size: int) -> Blocks:
     return blocks._replace(size=size)
 
 
-def _grown(blocks: Blocks) -> Blocks:
-    grown = new_blocks(2 * len(blocks.key))
+def _grown(blocks: Blocks, capacity: int) -> Blocks:
+    grown = new_blocks(capacity)
     for name in blocks._fields[3:]:
         old = getattr(blocks, name)
         getattr(grown, name)[:len(old)] = old
@@ -142,14 +155,22 @@ def place_of(key: np.int64) -> tuple[np.int64, np.int64, np.int64]:
 
 
 @njit(cache=True, nogil=True)
-def _slot(table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.int64) -> np.int64:
+def first_slot(table_key: NDArray[np.int64], key: np.int64) -> Any:
+    """Return where a key goes in an empty hash, uint64."""
+    mixed = uint64(key) * uint64(0x9E3779B97F4A7C15)
+    return (mixed ^ (mixed >> uint64(32))) & uint64(len(table_key) - 1)
+
+
+@njit(cache=True, nogil=True)
+def slot_of(
+    table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.int64
+) -> np.int64:
     """Return where a key is in the hash, or where it would go."""
     mask = uint64(len(table_key) - 1)
-    mixed = uint64(key) * uint64(0x9E3779B97F4A7C15)
-    slot = (mixed ^ (mixed >> uint64(32))) & mask
+    slot = first_slot(table_key, key)
     while table_block[slot] != 0 and table_key[slot] != key:
         slot = (slot + uint64(1)) & mask
-    return int64(slot)
+    return np.int64(slot)
 
 
 @njit(cache=True, nogil=True)
@@ -157,7 +178,7 @@ def find(
     table_key: NDArray[np.int64], table_block: NDArray[np.int32], key: np.int64
 ) -> np.int64:
     """Return the number of the block with a key, 0 where there is none."""
-    return np.int64(table_block[_slot(table_key, table_block, key)])
+    return np.int64(table_block[slot_of(table_key, table_block, key)])
 
 
 @njit(cache=True, nogil=True)
@@ -166,7 +187,7 @@ def _rehash(
     size: int,
 ) -> None:
     for block in range(1, size):
-        slot = _slot(table_key, table_block, key[block])
+        slot = slot_of(table_key, table_block, key[block])
         table_key[slot] = key[block]
         table_block[slot] = block
 
@@ -177,7 +198,7 @@ def _insert(
     found: NDArray[np.int32], count: int,
 ) -> tuple[int, int, int]:
     for i in range(done, len(keys)):
-        slot = _slot(blocks.table_key, blocks.table_block, keys[i])
+        slot = slot_of(blocks.table_key, blocks.table_block, keys[i])
         block = int64(blocks.table_block[slot])
         if block == 0:
             if size == len(blocks.key):

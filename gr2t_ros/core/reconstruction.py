@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError
 from ..settings import Settings
-from .blocks import linked, new_blocks, with_keys
+from .block_removal import without
+from .blocks import linked, new_blocks, NO_LIMIT, with_keys
 from .camera import Camera
 from .colour import Colouring
 from .confidence import deviations
@@ -28,6 +29,7 @@ from .exact_density import ExactDensity
 from .frozen import ASKING, frozen, Room
 from .poses import step
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
+from .release import MemoryBound, most_blocks, Sink
 from .shading import triangle_corners
 from .view import View
 from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
@@ -46,6 +48,7 @@ class Keyframe:
     :param blocks: the lattice's blocks that its rays need; None with the exact density
     :param checked: the density's change up to which all its rays are right
     :param shared: whether a frozen map has the same rays
+    :param released: whether its mesh was handed out for good, and only its pose is left
     """
 
     view: View
@@ -53,6 +56,7 @@ class Keyframe:
     blocks: NDArray[np.int32] | None
     checked: int = -1
     shared: bool = False
+    released: bool = False
 
     def own_rays(self) -> Rays:
         """Return the rays for a change, which is not seen where they are shared."""
@@ -72,6 +76,7 @@ class Update:
     :param converged: of these, rays that found their maximum
     :param waiting: rays of keyframes that are still to be looked at; not all need marching
     :param changed: keyframes whose rays were marched
+    :param released: keyframes whose meshes were handed out for good, to keep within max_memory_mb
     :param seconds: wall time of `integrate` and `march`
     :param notices: sentences that a user should read
     """
@@ -82,6 +87,7 @@ class Update:
     converged: int = 0
     waiting: int = 0
     changed: tuple[int, ...] = ()
+    released: tuple[int, ...] = ()
     seconds: dict[str, float] = field(default_factory=dict)
     notices: tuple[str, ...] = ()
 
@@ -91,15 +97,18 @@ class Reconstruction:
     Meshes from depth images with known poses.
 
     :param settings: bandwidths, thresholds, keyframe distances, threads
+    :param sink: takes the meshes of keyframes that leave where max_memory_mb is full, as
+        MemoryBound has it; without one there is no bound
 
     `keyframes` are the views that own a mesh, `density` is what all views built, `stamp_ns` is the
     newest stamp of these views.
     """
 
-    def __init__(self, settings: Settings) -> None:
+    def __init__(self, settings: Settings, sink: Sink | None = None) -> None:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
         self.stamp_ns = 0
+        self._bound = MemoryBound(sink)
         self._density: Density | None = None
         self._noticed: set[str] = set()
         self._pool: Executor | None = ThreadPoolExecutor(
@@ -128,6 +137,16 @@ class Reconstruction:
         return lattice.blocks.size - 1 if isinstance(lattice, VoxelDensity) else 0
 
     @property
+    def pool(self) -> Executor | None:
+        """Return where work is shared out; None: in the thread that asks."""
+        return self._pool
+
+    @property
+    def kept(self) -> int:
+        """Return the number of keyframes that have their rays."""
+        return sum(not keyframe.released for keyframe in self.keyframes)
+
+    @property
     def depth_max(self) -> float:
         """Return up to which depth (m) the map takes pixels, whatever the settings became."""
         lattice = self._density
@@ -141,7 +160,7 @@ class Reconstruction:
         waits for the next view or for finish.
 
         :param load: 0 to 1; this share of the budget is left out, as other views wait
-        :raises FrameError: if the depth image is not of its camera's size
+        :raises FrameError: if the depth image is not of its camera's size, or there is no memory
         """
         if view.depth.shape != (view.camera.height, view.camera.width):
             raise FrameError(
@@ -149,15 +168,18 @@ class Reconstruction:
                 f'of {view.camera.width} x {view.camera.height} pixels')
         began = perf_counter()
         notices = []
+        wanted = self._is_keyframe(view)
+        if self._density is not None:
+            self._bound.make_room(self, view, wanted)
+        made_room = perf_counter()
         if self._density is None:
             self._density, notice = self._new_density(view)
             notices += [notice] if notice else []
         self._density.add(view, self._pool)
         self.stamp_ns = max(self.stamp_ns, view.stamp_ns)
         notices += self._notice_aliasing(view)
-        wanted = self._is_keyframe(view)
         number = None
-        if wanted and len(self.keyframes) < self.settings.max_keyframes:
+        if wanted and self.kept < self.settings.max_keyframes:
             number = len(self.keyframes)
             self.keyframes.append(self._new_keyframe(view))
         elif wanted:
@@ -169,7 +191,9 @@ class Reconstruction:
             number, integrated + (1.0 - load) * self.settings.remarch_budget)
         return replace(
             update, keyframe=number, notices=tuple(notices),
-            seconds={'integrate': integrated - began, 'march': perf_counter() - integrated})
+            seconds={
+                'integrate': integrated - made_room, 'march': perf_counter() - integrated,
+                **({'release': made_room - began} if update.released else {})})
 
     def finish(self, budget: float = float('inf')) -> Update:
         """
@@ -180,6 +204,13 @@ class Reconstruction:
         began = perf_counter()
         update = self._march(None, began + budget)
         return replace(update, seconds={'march': perf_counter() - began})
+
+    def finish_keyframe(self, number: int) -> None:
+        """March those of a keyframe's rays that wait."""
+        self.density.refresh(self._pool)
+        rays = self.keyframes[number].own_rays()
+        chosen = stale(self.density, rays, slice(0, len(rays.pixels)), self._pool)
+        march(self.density, rays, chosen, self._pool)
 
     def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
         """
@@ -230,7 +261,7 @@ class Reconstruction:
         :param fields: of the lattice that it has; with state.ADDING it can be saved, not meshed
         """
         twin = copy(self)
-        twin._pool = None
+        twin._pool, twin._bound = None, MemoryBound(None)
         if self._density is not None:
             self._density.refresh(self._pool)
             twin._density = frozen(self._density, room, fields)
@@ -268,7 +299,7 @@ class Reconstruction:
                 f'depth of {median:.2f} m')
         return VoxelDensity(
             s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic, voxel_size,
-            s.depth_max), notice
+            s.depth_max, most_blocks(s) if self._bound.holds else NO_LIMIT), notice
 
     def _new_keyframe(self, view: View) -> Keyframe:
         rays = rays_of(
@@ -293,6 +324,7 @@ class Reconstruction:
         """March the new keyframe's rays, then what changed on others until the deadline."""
         if self._density is None:
             return Update()
+        released = self._bound.news()
         self._density.refresh(self._pool)
         marched = remarched = converged = 0
         changed: list[int] = []
@@ -322,6 +354,7 @@ class Reconstruction:
             break
         return Update(
             marched=marched, remarched=remarched, converged=converged, changed=tuple(changed),
+            released=released,
             waiting=sum(len(self.keyframes[number].rays.pixels) for number in waiting))
 
     def _waiting(self, new: int | None) -> list[int]:
@@ -387,6 +420,7 @@ def warm_up(settings: Settings) -> float:
         triangle_corners(
             mesh.vertices, mesh.faces, np.zeros(mesh.vertices.shape, np.uint8), shading=True)
     tiny.close()
-    with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
+    blocks, _ = with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
+    without(blocks, np.zeros(blocks.size, np.bool_), 1)
     linked(new_blocks(1), 1)
     return perf_counter() - began

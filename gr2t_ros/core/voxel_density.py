@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ..errors import FrameError, InputError
 from . import blocks as lattice
+from .block_removal import without
 from .blocks import Blocks, SIDE
 from .camera import Camera
 from .compiled import run_all
@@ -49,12 +50,13 @@ class VoxelDensity:
     :param depth_bandwidth_quadratic: growth of h3 with the squared depth, 1/metres
     :param voxel_size: metres; h3 is never below it
     :param depth_max: metres; larger depths count as invalid
+    :param most_blocks: that there may be, see blocks.with_keys
     :raises InputError: if a bandwidth or the voxel size is not positive
     """
 
     def __init__(
         self, pixel_bandwidth: float, depth_bandwidth: float, depth_bandwidth_quadratic: float,
-        voxel_size: float, depth_max: float,
+        voxel_size: float, depth_max: float, most_blocks: int = lattice.NO_LIMIT,
     ) -> None:
         if not (pixel_bandwidth > 0 and depth_bandwidth > 0 and depth_bandwidth_quadratic >= 0):
             raise InputError('bandwidths must be positive')
@@ -73,6 +75,7 @@ class VoxelDensity:
         self.pixels = 0
         self.aliased_pixels = 0  # nearer than the lattice can follow
         self._depth_of_bins = self.scale.depth_of_bins()
+        self._most_blocks = most_blocks
         self._change = 0
         self._recent: tuple[View, Warped] | None = None  # a keyframe's rays need its image again
         self._stale: list[NDArray[np.int32]] = []
@@ -105,7 +108,8 @@ class VoxelDensity:
         """
         before = self.blocks.size
         self._change += 1
-        self.blocks, found = lattice.with_keys(self.blocks, keys, self._change)
+        self.blocks, found = lattice.with_keys(
+            self.blocks, keys, self._change, self._most_blocks)
         if self.blocks.size > before:
             self._stale.append(np.arange(before, self.blocks.size, dtype=np.int32))
         return found
@@ -121,6 +125,19 @@ class VoxelDensity:
     def remove(self, view: View, pool: Executor | None = None) -> None:
         """Subtract what add() added for the same view."""
         self._accumulate(view, -1, pool)
+
+    def forget(
+        self, watched: NDArray[np.bool_], since: int, pool: Executor | None = None
+    ) -> NDArray[np.int32]:
+        """
+        Remove the blocks that neither rays need nor a view has touched after a change.
+
+        :param watched: (n,) for each block whether rays need it
+        :return: each former block's number now, (n,) int32; 0: it is gone
+        """
+        self.refresh(pool)
+        self.blocks, renumbered = without(self.blocks, watched, since)
+        return renumbered
 
     def refresh(self, pool: Executor | None = None) -> None:
         """Bring the spline up to date with the samples; before asking for anything."""
@@ -243,7 +260,7 @@ class VoxelDensity:
         self.aliased_pixels += sign * int(np.count_nonzero(view.depth < nearest))
         self._change += 1
         self.blocks, touched = lattice.with_keys(
-            self.blocks, np.concatenate(keys), self._change)
+            self.blocks, np.concatenate(keys), self._change, self._most_blocks)
         if len(touched) == 0:
             return
         run_all(pool, add_to_blocks, [
