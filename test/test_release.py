@@ -8,6 +8,7 @@ import pytest
 from scenes_for_tests import plane_view, pose
 
 from gr2t_ros.core.camera import Camera
+from gr2t_ros.core.colour import Colouring
 from gr2t_ros.core.ray_march import Rays
 from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.release import BYTES_PER_RAY, limit_of, used_by
@@ -34,10 +35,10 @@ class Disk:
         self.meshes: dict[int, ViewMesh] = {}
         self.full = False
 
-    def __call__(self, number: int, mesh: ViewMesh, scale: float) -> None:
+    def __call__(self, number: int, mesh: ViewMesh, colouring: Colouring) -> None:
         if self.full:
             raise Gr2tError('cannot write part.ply: No space left on device')
-        assert scale > 0
+        assert colouring.scale > 0
         self.meshes[number] = mesh
 
 

@@ -24,7 +24,7 @@ from .block_removal import without
 from .blocks import linked, new_blocks, NO_LIMIT, with_keys
 from .camera import Camera
 from .colour import Colouring
-from .confidence import deviations
+from .colour_scale import robust_maximum
 from .exact_density import ExactDensity
 from .frozen import ASKING, frozen, Room
 from .poses import step
@@ -32,11 +32,10 @@ from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .release import MemoryBound, most_blocks, Sink
 from .shading import triangle_corners
 from .view import View
-from .view_mesh import ROBUST_MAXIMUM, view_mesh, ViewMesh
+from .view_mesh import view_mesh, ViewMesh
 from .voxel_density import VoxelDensity
 
 _SLICE = 65536  # rays marched between two looks at the clock
-_COLOUR_SAMPLES = 50_000  # deviations that make a colour scale
 _ALIASED = 0.05  # share of pixels too near for the voxel size that is worth a notice
 
 
@@ -231,25 +230,11 @@ class Reconstruction:
 
     def colouring(self) -> Colouring:
         """Return how points are coloured, up to the robust maximum over all keyframes."""
-        s = self.settings
-        values = self._deviations() if s.color_by == 'sigma' else self._likelihoods()
-        scale = float(np.percentile(values, ROBUST_MAXIMUM)) if len(values) else 0.0
-        return Colouring(s.color_by, scale, s.colour_map)
-
-    def _likelihoods(self) -> NDArray[np.floating]:
-        totals = [
-            keyframe.rays.total[keyframe.rays.converged] for keyframe in self.keyframes]
-        return np.concatenate(totals) / self.density.size if totals else np.zeros(0)
-
-    def _deviations(self) -> NDArray[np.float32]:
-        """Return sigmas (m) of some rays of each keyframe: each has to ask the density."""
-        samples = [np.zeros(0, np.float32)]
-        for keyframe in self.keyframes:
-            found = np.flatnonzero(keyframe.rays.converged)
-            step = len(self.keyframes) * len(found) // _COLOUR_SAMPLES + 1
-            samples.append(deviations(self.density, keyframe.rays, found[::step]))
-        sigma = np.concatenate(samples)
-        return sigma[np.isfinite(sigma)]
+        density = self._density
+        scale = robust_maximum(
+            self.settings.color_by, density, [item.rays for item in self.keyframes]
+        ) if density is not None else 0.0
+        return Colouring(self.settings.color_by, scale, self.settings.colour_map)
 
     def frozen(self, room: Room, fields: Sequence[str] = ASKING) -> Reconstruction:
         """

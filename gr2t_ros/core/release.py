@@ -20,6 +20,7 @@ import numpy as np
 from ..errors import FrameError, Gr2tError
 from ..settings import Settings
 from .blocks import BYTES_PER_BLOCK, VOXELS
+from .colour import Colouring
 from .ray_march import Density, Rays
 from .view import View
 from .voxel_density import VoxelDensity
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from .reconstruction import Keyframe, Reconstruction
     from .view_mesh import ViewMesh
 
-Sink = Callable[[int, 'ViewMesh', float], None]
+Sink = Callable[[int, 'ViewMesh', Colouring], None]
 
 _SLOTS = 4 * (8 + 4)  # bytes of the hash for a block, at least
 # with what a snapshot copies of it, see frozen.py
@@ -43,8 +44,8 @@ class MemoryBound:
     """
     Holds an engine's memory to settings.max_memory_mb.
 
-    :param sink: takes a keyframe's number, its mesh and the likelihood that gets the last colour;
-        raises Gr2tError where it cannot keep them. None: there is no bound
+    :param sink: takes a keyframe's number, its mesh and how the map is coloured now; raises
+        Gr2tError where it cannot keep them. None: there is no bound
     """
 
     def __init__(self, sink: Sink | None) -> None:
@@ -94,7 +95,7 @@ class MemoryBound:
         if monotonic() >= self._again:
             try:
                 engine.finish_keyframe(number)
-                self._sink(number, engine.mesh(number), engine.colour_scale())
+                self._sink(number, engine.mesh(number), engine.colouring())
                 self._failure = ''
             except Gr2tError as error:
                 self._failure = str(error)
