@@ -8,10 +8,12 @@ from gr2t_ros.core.block_removal import without
 from gr2t_ros.core.blocks import (
     Blocks,
     COEFFICIENTS,
+    copy_margins,
     find,
     key_of,
     new_blocks,
     place_of,
+    prefilter,
     VOXELS,
     with_keys,
 )
@@ -41,9 +43,7 @@ def check(blocks: Blocks, places: np.ndarray) -> None:
     for place in there:
         block = int(find(blocks.table_key, blocks.table_block, key_of(*place)))
         assert 0 < block < blocks.size and place_of(blocks.key[block]) == place
-        for values, each in (
-                (blocks.value, VOXELS), (blocks.expected, VOXELS),
-                (blocks.coefficient, COEFFICIENTS)):
+        for values, each in ((blocks.value, VOXELS), (blocks.expected, VOXELS)):
             expected = each + np.array(place) @ [1, 100, 10_000]
             assert (values[block * each:(block + 1) * each] == expected).all()
         for n in range(27):
@@ -68,7 +68,7 @@ def test_what_stays_is_found_and_what_leaves_is_not(share: float) -> None:
     blocks = lattice_of(places)
     stays = rng.random(len(places)) < share
     blocks.touched[1:blocks.size][stays] = SINCE + 1
-    fewer, renumbered = without(blocks, np.zeros(blocks.size, np.bool_), SINCE)
+    fewer, renumbered, _ = without(blocks, np.zeros(blocks.size, np.bool_), SINCE)
     check(fewer, places[stays])
     assert renumbered[0] == 0 and ((renumbered[1:] > 0) == stays).all()
     for place, number in zip(places[stays], renumbered[1:][stays]):
@@ -84,8 +84,36 @@ def test_what_a_watched_block_s_spline_depends_on_stays() -> None:
     blocks = lattice_of(places)
     watched = np.zeros(blocks.size, np.bool_)
     watched[find(blocks.table_key, blocks.table_block, key_of(0, 0, 0))] = True
-    fewer, _ = without(blocks, watched, SINCE)
+    fewer, *_ = without(blocks, watched, SINCE)
     check(fewer, places[((places >= -1) & (places <= 2)).all(axis=1)])
+
+
+def test_the_spline_is_that_of_the_blocks_that_stay() -> None:
+    rng = np.random.default_rng(1)
+    places = np.unique(rng.integers(-6, 6, (900, 3)), axis=0)
+    rng.shuffle(places)
+    stays = rng.random(len(places)) < 0.5
+    lattices = []
+    for chosen in (places, places[stays]):
+        blocks, found = with_keys(new_blocks(16), keys_of(chosen), SINCE + 1)
+        for place, block in zip(chosen, found):
+            blocks.value[block * VOXELS:(block + 1) * VOXELS] = np.random.default_rng(
+                place + 10).random(VOXELS, np.float32)
+        prefilter(blocks, found)
+        copy_margins(blocks, found)
+        lattices.append(blocks)
+    blocks, expected = lattices
+    blocks.touched[1:blocks.size][~stays] = 0
+    fewer, _, border = without(blocks, np.zeros(blocks.size, np.bool_), SINCE)
+    prefilter(fewer, border)
+    copy_margins(fewer, border)
+    for place in places[stays]:
+        ours, theirs = (
+            int(find(item.table_key, item.table_block, key_of(*place))) * COEFFICIENTS
+            for item in (fewer, expected))
+        np.testing.assert_array_equal(
+            fewer.coefficient[ours:ours + COEFFICIENTS],
+            expected.coefficient[theirs:theirs + COEFFICIENTS])
 
 
 def test_memory_is_given_back() -> None:
@@ -97,6 +125,6 @@ def test_memory_is_given_back() -> None:
     places = np.stack(np.meshgrid(side, side, side), axis=-1).reshape(-1, 3)
     blocks = lattice_of(places, len(places) + 1)
     before = resident()
-    fewer, _ = without(blocks, np.zeros(blocks.size, np.bool_), SINCE)
+    fewer, *_ = without(blocks, np.zeros(blocks.size, np.bool_), SINCE)
     assert fewer.size == 1
     assert before - resident() > 0.9 * 4 * len(places) * (2 * VOXELS + COEFFICIENTS)

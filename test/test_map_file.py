@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes_for_tests import bumpy_views
+from scenes_for_tests import bumpy_views, plane_view, pose
 
+from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.frozen import room_for
 from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.state import ADDING, columns_of, state_of
@@ -95,6 +96,30 @@ def test_it_goes_on_as_if_it_had_not_been_interrupted(
     assert_same_state(half, whole)
     assert half.finish().remarched == whole.finish().remarched
     assert_same_state(half, whole)
+
+
+def test_keyframes_that_left_memory_stay_known(tmp_path: Path) -> None:
+    """With blocks that are gone, and a spline beside them that follows from what is left."""
+    settings = SETTINGS.updated({
+        'voxel_size': 0.02, 'depth_bandwidth': 0.02, 'max_keyframes': 9, 'depth_max': 0.8})
+    camera = Camera(80, 60, 90.0, 90.0, 39.5, 29.5)
+    some = [plane_view(camera, pose([0, 0, 0], [0.2 * n, 0, 0]), [0, 0, 1], 0.5)
+            for n in range(40)]
+    whole, left = built([], settings), []
+    whole.sink = lambda number, mesh, colouring: left.append(number)
+    for view in some[:-8]:
+        whole.add(view)
+    assert left and whole.keyframes[0].released
+    path = tmp_path / 'map.gr2t'
+    save_map(path, whole, 'map')
+    part = loaded(path, settings)
+    part.sink = whole.sink
+    assert_same_state(part, whole)
+    for view in some[-8:]:
+        whole.add(view)
+        part.add(view)
+    assert left[-1] == left[-2], 'both released it'
+    assert_same_state(part, whole)
 
 
 @pytest.mark.parametrize('density', ['voxel', 'exact'])

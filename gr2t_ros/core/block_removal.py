@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from .blocks import Blocks, COEFFICIENTS, first_slot, Floats, slot_of, VOXELS
 from .compiled import uncounted
+from .vector import ROW
 
 _SELF = 13  # of the 27 neighbours
 
 
 def without(
     blocks: Blocks, watched: NDArray[np.bool_], since: int
-) -> tuple[Blocks, NDArray[np.int32]]:
+) -> tuple[Blocks, NDArray[np.int32], NDArray[np.int32]]:
     """
     Remove the blocks that no ray needs and that no recent view touched.
 
@@ -25,14 +26,16 @@ def without(
     :param watched: (size,) the blocks that rays' search intervals need; those about them that
         their spline depends on stay, too
     :param since: blocks touched after this change stay
-    :return: the lattice, and for each former block its number now, (size,) int32; 0: removed
+    :return: the lattice; for each former block its number now, (size,) int32, 0: removed; (n,)
+        int32, the blocks beside removed ones, whose coefficients are to be computed again
     """
     size = blocks.size
     needed = np.zeros(size, np.bool_)
     _mark_needed(blocks.neighbour, watched, np.zeros(size, np.bool_), needed)
     needed |= blocks.touched[:size] > since
     renumbered = np.zeros(size, np.int32)
-    end = int(_remove(blocks, size, needed, renumbered))
+    beside = np.zeros(size, np.bool_)
+    end = int(_remove(blocks, size, needed, renumbered, beside))
     blocks.key[end:size] = -1
     blocks.neighbour[end:size] = 0
     blocks.touched[end:size] = 0
@@ -41,7 +44,8 @@ def without(
             (blocks.value, VOXELS), (blocks.expected, VOXELS), (blocks.coefficient, COEFFICIENTS)):
         values[end * each:size * each] = 0
         _give_back(values, end * each, size * each)
-    return blocks._replace(size=end), renumbered
+    border = renumbered[beside]
+    return blocks._replace(size=end), renumbered, np.sort(border[border > 0])
 
 
 @njit(cache=True, nogil=True)
@@ -62,14 +66,26 @@ def _mark_needed(
 
 @uncounted()
 def _remove(
-    blocks: Blocks, size: int, needed: NDArray[np.bool_], renumbered: NDArray[np.int32]
+    blocks: Blocks, size: int, needed: NDArray[np.bool_], renumbered: NDArray[np.int32],
+    beside: NDArray[np.bool_],
 ) -> int:
-    """Fill the places of those that go with the last ones; return the number of blocks."""
+    """
+    Fill the places of those that go with the last ones; return the number of blocks.
+
+    :param beside: where to mark the neighbours of those that go
+    """
     for block in range(1, size):
         if not needed[block]:
             _erase(blocks.table_key, blocks.table_block, blocks.key[block])
             for n in range(27):
-                blocks.neighbour[blocks.neighbour[block, n], 26 - n] = 0
+                other = blocks.neighbour[block, n]
+                blocks.neighbour[other, 26 - n] = 0
+                beside[other] = True
+            # its first coefficients stood behind the rows of the block before it, see copy_margins
+            rows = blocks.neighbour[block, _SELF - 1] * COEFFICIENTS + 8
+            for line in range(64):
+                for x in range(3):
+                    blocks.coefficient[rows + line * ROW + x] = 0
     block, end = 1, size
     while block < end:
         if not needed[block]:

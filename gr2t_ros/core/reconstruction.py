@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError
 from ..settings import Settings
 from .block_removal import without
-from .blocks import linked, new_blocks, NO_LIMIT, with_keys
+from .blocks import linked, new_blocks, with_keys
 from .camera import Camera
 from .colour import Colouring
 from .colour_scale import robust_maximum
@@ -29,7 +29,7 @@ from .exact_density import ExactDensity
 from .frozen import ASKING, frozen, Room
 from .poses import step
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
-from .release import MemoryBound, most_blocks, Sink
+from .release import MemoryBound, Sink
 from .shading import triangle_corners
 from .view import View
 from .view_mesh import view_mesh, ViewMesh
@@ -97,7 +97,7 @@ class Reconstruction:
 
     :param settings: bandwidths, thresholds, keyframe distances, threads
     :param sink: takes the meshes of keyframes that leave where max_memory_mb is full, as
-        MemoryBound has it; without one there is no bound
+        MemoryBound has it; without one there is no bound; may be set
 
     `keyframes` are the views that own a mesh, `density` is what all views built, `stamp_ns` is the
     newest stamp of these views.
@@ -107,7 +107,8 @@ class Reconstruction:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
         self.stamp_ns = 0
-        self._bound = MemoryBound(sink)
+        self.sink = sink
+        self._bound = MemoryBound()
         self._density: Density | None = None
         self._noticed: set[str] = set()
         self._pool: Executor | None = ThreadPoolExecutor(
@@ -134,11 +135,6 @@ class Reconstruction:
         """Return the number of the lattice's blocks; the first stands for none."""
         lattice = self._density
         return lattice.blocks.size - 1 if isinstance(lattice, VoxelDensity) else 0
-
-    @property
-    def pool(self) -> Executor | None:
-        """Return where work is shared out; None: in the thread that asks."""
-        return self._pool
 
     @property
     def kept(self) -> int:
@@ -190,9 +186,8 @@ class Reconstruction:
             number, integrated + (1.0 - load) * self.settings.remarch_budget)
         return replace(
             update, keyframe=number, notices=tuple(notices),
-            seconds={
-                'integrate': integrated - made_room, 'march': perf_counter() - integrated,
-                **({'release': made_room - began} if update.released else {})})
+            seconds={'integrate': integrated - made_room, 'march': perf_counter() - integrated} | (
+                {'release': made_room - began} if update.released else {}))
 
     def finish(self, budget: float = float('inf')) -> Update:
         """
@@ -203,13 +198,6 @@ class Reconstruction:
         began = perf_counter()
         update = self._march(None, began + budget)
         return replace(update, seconds={'march': perf_counter() - began})
-
-    def finish_keyframe(self, number: int) -> None:
-        """March those of a keyframe's rays that wait."""
-        self.density.refresh(self._pool)
-        rays = self.keyframes[number].own_rays()
-        chosen = stale(self.density, rays, slice(0, len(rays.pixels)), self._pool)
-        march(self.density, rays, chosen, self._pool)
 
     def mesh(self, keyframe: int, stride: int = 1) -> ViewMesh:
         """
@@ -246,7 +234,7 @@ class Reconstruction:
         :param fields: of the lattice that it has; with state.ADDING it can be saved, not meshed
         """
         twin = copy(self)
-        twin._pool, twin._bound = None, MemoryBound(None)
+        twin._pool, twin._bound, twin.sink = None, MemoryBound(), None
         if self._density is not None:
             self._density.refresh(self._pool)
             twin._density = frozen(self._density, room, fields)
@@ -284,7 +272,7 @@ class Reconstruction:
                 f'depth of {median:.2f} m')
         return VoxelDensity(
             s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic, voxel_size,
-            s.depth_max, most_blocks(s) if self._bound.holds else NO_LIMIT), notice
+            s.depth_max), notice
 
     def _new_keyframe(self, view: View) -> Keyframe:
         rays = rays_of(

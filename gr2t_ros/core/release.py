@@ -21,7 +21,7 @@ from ..errors import FrameError, Gr2tError
 from ..settings import Settings
 from .blocks import BYTES_PER_BLOCK, VOXELS
 from .colour import Colouring
-from .ray_march import Density, Rays
+from .ray_march import Density, march, Rays, stale
 from .view import View
 from .voxel_density import VoxelDensity
 
@@ -42,22 +42,16 @@ _PAUSE = 5.0  # s before a sink that failed is tried again
 
 class MemoryBound:
     """
-    Holds an engine's memory to settings.max_memory_mb.
+    Holds an engine's memory to settings.max_memory_mb, where it has a sink.
 
-    :param sink: takes a keyframe's number, its mesh and how the map is coloured now; raises
-        Gr2tError where it cannot keep them. None: there is no bound
+    A sink takes a keyframe's number, its mesh and how the map is coloured now; it raises Gr2tError
+    where it cannot keep them.
     """
 
-    def __init__(self, sink: Sink | None) -> None:
-        self._sink = sink
+    def __init__(self) -> None:
         self._failure = ''
         self._again = 0.0  # by the monotonic clock
         self._news: list[int] = []
-
-    @property
-    def holds(self) -> bool:
-        """Return whether there is a bound."""
-        return self._sink is not None
 
     def news(self) -> tuple[int, ...]:
         """Return the keyframes that were released since this was asked last."""
@@ -72,9 +66,11 @@ class MemoryBound:
             far away to see what the view sees leaves
         :raises FrameError: if there is nothing to release, or the sink fails; nothing is lost then
         """
-        if self._sink is None:
+        if engine.sink is None:
             return
         limit = limit_of(engine.settings)
+        if isinstance(engine.density, VoxelDensity):
+            engine.density.most_blocks = limit // _BYTES
         while used_by(engine) > limit:
             number, _ = _farthest(engine, view)
             if number is None:
@@ -91,11 +87,10 @@ class MemoryBound:
                 self._release(engine, number)
 
     def _release(self, engine: Reconstruction, number: int) -> None:
-        assert self._sink is not None
-        if monotonic() >= self._again:
+        if engine.sink is not None and monotonic() >= self._again:
             try:
-                engine.finish_keyframe(number)
-                self._sink(number, engine.mesh(number), engine.colouring())
+                _finish(engine, number)
+                engine.sink(number, engine.mesh(number), engine.colouring())
                 self._failure = ''
             except Gr2tError as error:
                 self._failure = str(error)
@@ -114,11 +109,6 @@ def limit_of(settings: Settings) -> int:
     if settings.max_memory_mb:
         return settings.max_memory_mb * 10 ** 6
     return os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') // 2
-
-
-def most_blocks(settings: Settings) -> int:
-    """Return how many blocks there may be."""
-    return max(limit_of(settings) // _BYTES, 1)
 
 
 def used_by(engine: Reconstruction) -> int:
@@ -149,6 +139,14 @@ def _farthest(engine: Reconstruction, view: View) -> tuple[int | None, float]:
             if away > most:
                 farthest, most = number, away
     return farthest, most
+
+
+def _finish(engine: Reconstruction, number: int) -> None:
+    """March those of a keyframe's rays that wait."""
+    engine.density.refresh(engine.pool)
+    rays = engine.keyframes[number].own_rays()
+    chosen = stale(engine.density, rays, slice(0, len(rays.pixels)), engine.pool)
+    march(engine.density, rays, chosen, engine.pool)
 
 
 def _empty(keyframe: Keyframe) -> None:

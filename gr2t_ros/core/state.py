@@ -49,7 +49,7 @@ _RAYS: dict[str, Kind] = {
     'marched': ('<i4', ())}
 _KEYFRAME: dict[str, Kind] = {
     'camera': ('<i4', ()), 'T_world_camera': ('<f8', (4, 4)), 'stamp_ns': ('<i8', ()),
-    'checked': ('<i8', ()), 'rays': ('<i8', ()), 'blocks': ('<i8', ())}
+    'checked': ('<i8', ()), 'released': ('|u1', ()), 'rays': ('<i8', ()), 'blocks': ('<i8', ())}
 
 
 def columns_of(density: str) -> dict[str, Kind]:
@@ -105,6 +105,7 @@ def state_of(reconstruction: Reconstruction) -> State:
         'T_world_camera': [item.view.T_world_camera for item in keyframes],
         'stamp_ns': [item.view.stamp_ns for item in keyframes],
         'checked': [item.checked for item in keyframes],
+        'released': [item.released for item in keyframes],
         'rays': [len(item.rays.pixels) for item in keyframes],
         'blocks': [0 if item.blocks is None else len(item.blocks) for item in keyframes]}
     numbers, columns = _density_state(density)
@@ -224,8 +225,10 @@ def _keyframes(
         ((heads['camera'] >= 0) & (heads['camera'] < len(cameras))).all(), 'cameras')
     _insist((np.abs(heads['T_world_camera']) < _MAX_DISTANCE).all(), 'poses')
     _insist((heads['rays'] >= 0).all() and (heads['blocks'] >= 0).all(), 'number of rays')
-    pixels = [
-        cameras[camera][0].width * cameras[camera][0].height for camera in heads['camera']]
+    shapes = [
+        (0, 0) if released else (cameras[camera][0].height, cameras[camera][0].width)
+        for camera, released in zip(heads['camera'], heads['released'])]
+    pixels = [height * width for height, width in shapes]
     rays = _Pieces(columns, [f'ray_{name}' for name in _RAYS], heads['rays'].tolist())
     watched = _Pieces(columns, ['keyframe_watched'], heads['blocks'].tolist())
     images = _Pieces(columns, ['keyframe_image'], pixels)
@@ -234,7 +237,7 @@ def _keyframes(
         T_world_camera = heads['T_world_camera'][n].copy()
         depth, = images.read(n)
         view = View(
-            depth.reshape(camera.height, camera.width), camera, T_world_camera,
+            depth.reshape(shapes[n]), camera, T_world_camera,
             int(heads['stamp_ns'][n]), name, frame_id)
         found = dict(zip(_RAYS, rays.read(n)))
         steps = np.diff(found['pixels'], prepend=-1, append=pixels[n])
@@ -246,7 +249,7 @@ def _keyframes(
             _insist(((blocks > 0) & (blocks < density.blocks.size)).all(), 'watched blocks')
         yield Keyframe(
             view, Rays(table=camera.rays, T_world_camera=T_world_camera.copy(), **found),
-            blocks, int(heads['checked'][n]))
+            blocks, int(heads['checked'][n]), released=bool(heads['released'][n]))
 
 
 class _Pieces:

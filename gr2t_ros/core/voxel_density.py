@@ -50,13 +50,14 @@ class VoxelDensity:
     :param depth_bandwidth_quadratic: growth of h3 with the squared depth, 1/metres
     :param voxel_size: metres; h3 is never below it
     :param depth_max: metres; larger depths count as invalid
-    :param most_blocks: that there may be, see blocks.with_keys
     :raises InputError: if a bandwidth or the voxel size is not positive
+
+    most_blocks: that are expected, see blocks.with_keys; may be set.
     """
 
     def __init__(
         self, pixel_bandwidth: float, depth_bandwidth: float, depth_bandwidth_quadratic: float,
-        voxel_size: float, depth_max: float, most_blocks: int = lattice.NO_LIMIT,
+        voxel_size: float, depth_max: float,
     ) -> None:
         if not (pixel_bandwidth > 0 and depth_bandwidth > 0 and depth_bandwidth_quadratic >= 0):
             raise InputError('bandwidths must be positive')
@@ -75,7 +76,7 @@ class VoxelDensity:
         self.pixels = 0
         self.aliased_pixels = 0  # nearer than the lattice can follow
         self._depth_of_bins = self.scale.depth_of_bins()
-        self._most_blocks = most_blocks
+        self.most_blocks = lattice.NO_LIMIT
         self._change = 0
         self._recent: tuple[View, Warped] | None = None  # a keyframe's rays need its image again
         self._stale: list[NDArray[np.int32]] = []
@@ -109,7 +110,7 @@ class VoxelDensity:
         before = self.blocks.size
         self._change += 1
         self.blocks, found = lattice.with_keys(
-            self.blocks, keys, self._change, self._most_blocks)
+            self.blocks, keys, self._change, self.most_blocks)
         if self.blocks.size > before:
             self._stale.append(np.arange(before, self.blocks.size, dtype=np.int32))
         return found
@@ -136,7 +137,8 @@ class VoxelDensity:
         :return: each former block's number now, (n,) int32; 0: it is gone
         """
         self.refresh(pool)
-        self.blocks, renumbered = without(self.blocks, watched, since)
+        self.blocks, renumbered, border = without(self.blocks, watched, since)
+        self._filter(border, pool)
         return renumbered
 
     def refresh(self, pool: Executor | None = None) -> None:
@@ -260,7 +262,7 @@ class VoxelDensity:
         self.aliased_pixels += sign * int(np.count_nonzero(view.depth < nearest))
         self._change += 1
         self.blocks, touched = lattice.with_keys(
-            self.blocks, np.concatenate(keys), self._change, self._most_blocks)
+            self.blocks, np.concatenate(keys), self._change, self.most_blocks)
         if len(touched) == 0:
             return
         run_all(pool, add_to_blocks, [
