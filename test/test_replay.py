@@ -198,3 +198,41 @@ def test_the_kitchen_needs_no_option_but_patience(data: Path, tmp_path: Path) ->
     vertices = ply.read(tmp_path / 'out' / 'mesh.ply').mesh.vertices
     assert len(vertices) > 1000
     assert np.all(np.ptp(vertices, axis=0) < 10)  # a room
+
+
+def test_what_does_not_fit_into_memory_is_on_the_disk(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The parts and the rest are all keyframes; no frame is dropped; a former run's parts go."""
+    bag = bags.write(tmp_path / 'scan', bags.scan(60))
+    out = tmp_path / 'out'
+    assert replay(
+        bag, '-o', out, '--per-view', '-p', 'max_memory_mb:=3', '-p', 'voxel_size:=0.02') == 0
+    found, printed = report(out), capsys.readouterr()
+    assert found['frames']['dropped'] == {}
+    parts = sorted((out / 'parts').iterdir())
+    left = found['parts']['keyframes']
+    assert 0 < left == len(parts) < found['frames']['keyframes']
+    meshes = [ply.read(path) for path in parts]
+    rest = ply.read(out / 'mesh.ply')
+    assert sum(len(mesh.mesh.faces) for mesh in meshes) == found['parts']['faces'] > 0
+    views = [set(mesh.vertex_view) for mesh in [*meshes, rest]]
+    assert sorted(number for some in views for number in some) == list(
+        range(found['frames']['keyframes']))
+    for mesh in [*meshes, rest]:
+        assert np.abs(mesh.mesh.vertices[:, 2] - 1).mean() < 0.002
+    assert len(list((out / 'views').iterdir())) == found['frames']['keyframes'] - left
+    assert f'go to {out / "parts"}, a PLY file each' in printed.err
+    assert f'the {len(views[-1])} keyframes still in memory' in printed.out
+    assert f'the other {left} keyframes, finished, a file each' in printed.out
+    assert replay(bag, '-o', out) == 0
+    assert list((out / 'parts').iterdir()) == []
+
+
+def test_a_bound_that_no_map_fits_into_ends_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = bags.write(tmp_path / 'scan', bags.scan(6))
+    assert replay(bag, '-o', tmp_path / 'out', '-p', 'max_memory_mb:=1') == 1
+    assert 'max_memory_mb allows 1: raise it' in capsys.readouterr().err
+    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 0, 'what was done is kept'

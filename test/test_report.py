@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from gr2t_ros.errors import Gr2tError
+from gr2t_ros.io.parts import Parts
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools import report
 
@@ -19,7 +20,7 @@ SPREAD = {'mean', 'p50', 'p95'}
 def run() -> report.Run:
     """Return a run whose numbers are easy."""
     run = report.Run(
-        Settings(), read=12, integrated=10, keyframes=2, dropped=Counter(no_pose=2),
+        Settings(), Parts(Path), read=12, integrated=10, keyframes=2, dropped=Counter(no_pose=2),
         explanations={'no_pose': 'no pose at all', 'bad_transform': 'a NaN transform'},
         marched=100, remarched=50, converged=140, loop_seconds=4.0, startup_seconds=1.5,
         finish_seconds=0.5, first_stamp_ns=10 ** 18, last_stamp_ns=10 ** 18 + 2 * 10 ** 9)
@@ -31,13 +32,14 @@ def test_the_keys_are_those_of_the_documentation(run: report.Run) -> None:
     content = report.report(run, {'vertices': 3, 'edges': 2, 'faces': 1}, np.arange(101.0))
     assert set(content) == {
         'frames', 'rays', 'timing_ms', 'frames_per_second', 'realtime_factor', 'peak_memory_mb',
-        'mesh', 'likelihood', 'startup_s', 'finish_s', 'input_damage', 'settings'}
+        'mesh', 'parts', 'likelihood', 'startup_s', 'finish_s', 'input_damage', 'settings'}
     assert content['frames'] == {
         'read': 12, 'integrated': 10, 'keyframes': 2, 'dropped': {'no_pose': 2}}
     assert content['rays'] == {'marched': 100, 'remarched': 50, 'converged': 140}
     assert set(content['timing_ms']) == {'read', 'integrate', 'march', 'mesh', 'total'}
     assert all(set(entry) == SPREAD for entry in content['timing_ms'].values())
     assert content['likelihood'] == {'max': 100.0, 'p50': 50.0, 'p98': 98.0}
+    assert content['parts'] == {'keyframes': 0, 'vertices': 0, 'edges': 0, 'faces': 0}
     assert content['settings']['depth_max'] == Settings().depth_max
 
 

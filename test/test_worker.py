@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scenes_for_tests import looking_at_origin, plane_view
+from scenes_for_tests import looking_at_origin, plane_view, pose
 
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.reconstruction import Reconstruction, Update
@@ -26,6 +26,7 @@ from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
 
 LIMIT = 60.0  # s
 COUNT = 5
+WALL = 14  # frames
 
 
 class Outputs:
@@ -120,7 +121,7 @@ def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
     """Return a function that makes a running worker with some parameters."""
     rigs = []
 
-    def rig(start: bool = True, **values: object) -> Rig:
+    def rig(start: bool = True, bag: Path = bag, **values: object) -> Rig:
         settings = Settings().updated({
             'publish_rate': 60.0, 'snapshot_directory': str(tmp_path / 'snapshots'), **values})
         rigs.append(Rig(bag, settings))
@@ -353,6 +354,59 @@ def test_images_whose_pose_never_comes_are_given_up(make: Callable[..., Rig]) ->
     (reason, count), = rig.dropped.items()
     assert count == COUNT
     assert rig.said(f'[{reason}: said once') == 1
+
+
+@pytest.fixture(scope='module')
+def path_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of a camera that leaves behind what it saw."""
+    camera = Camera(48, 36, 45.0, 45.0, 23.5, 17.5)
+    path = tmp_path_factory.mktemp('bags') / 'wall'
+    record(path, [
+        replace(
+            plane_view(camera, pose([0, 0, 0], [0.5 * i, 0, 0]), (0, 0, 1), 0.6),
+            stamp_ns=1_700_000_000_000_000_000 + i * 100_000_000)
+        for i in range(WALL)])
+    return path
+
+
+def test_what_leaves_memory_is_in_the_snapshots_folder(
+    make: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
+) -> None:
+    rig = make(bag=path_along_a_wall, max_keyframes=9, depth_max=0.9, queue_size=WALL)
+    rig.feed()
+    rig.wait(lambda: rig.integrated == WALL, 'all frames')
+    rig.wait(lambda: rig.worker.parts.keyframes == WALL - 9, 'those far away to leave')
+    rig.wait(lambda: rig.outputs.changed >= set(range(WALL)), 'their meshes to be taken back')
+    folder, = tmp_path.glob('snapshots/parts_*')
+    assert rig.said(f'finished, each becomes a PLY file in {folder}') == 1
+    views = [set(read(path).vertex_view) for path in sorted(folder.iterdir())]
+    assert views == [{number} for number in range(WALL - 9)]
+    saved = rig.worker.snapshot().result(LIMIT)
+    assert set(read(saved.file.path).vertex_view) == set(range(WALL - 9, WALL))
+    assert f'; {WALL - 9} keyframes that left memory are in {folder}: ' in str(saved)
+    used, limit = rig.worker.memory
+    assert 0 < used < limit
+    rig.worker.reset()
+    rig.wait(lambda: rig.outputs.cleared, 'the reset')
+    rig.feed()
+    rig.wait(lambda: rig.integrated == 2 * WALL, 'another map')
+    assert len(list(tmp_path.glob('snapshots/parts_*'))) == 2
+    rig.worker.stop()
+    assert 'keyframes that left memory are in' in rig.worker.summary()
+
+
+def test_frames_are_refused_where_nothing_can_leave_memory(
+    make: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
+) -> None:
+    (tmp_path / 'file').write_text('')
+    rig = make(
+        bag=path_along_a_wall, max_keyframes=9, depth_max=0.9, queue_size=WALL,
+        snapshot_directory=str(tmp_path / 'file' / 'inside'))
+    rig.feed()
+    rig.wait(lambda: rig.dropped.get('memory') == WALL - 9, 'the others to be refused')
+    assert rig.integrated == 9
+    assert 'cannot make the folder' in rig.worker.explanations['memory']
+    assert rig.said('[memory: said once, then counted]') == 1
 
 
 def test_rays_that_wait_are_marched_when_idle(make: Callable[..., Rig]) -> None:

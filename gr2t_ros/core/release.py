@@ -113,6 +113,8 @@ def limit_of(settings: Settings) -> int:
 
 def used_by(engine: Reconstruction) -> int:
     """Return the bytes of a map: blocks, also as copied for a snapshot, keyframes, exact views."""
+    if not engine.keyframes:
+        return 0
     return bytes_of_density(engine.density) + sum(map(bytes_of_keyframe, engine.keyframes))
 
 

@@ -25,10 +25,12 @@ class Snapshot:
 
     :param file: the path and the counts
     :param likelihood: least and largest of the vertices, 1 / (px^2 m)
+    :param elsewhere: what of the map is in other files, as a sentence
     """
 
     file: Written
     likelihood: tuple[float, float]
+    elsewhere: str = ''
 
     def __str__(self) -> str:
         """Return the path, ': ' and what the file holds."""
@@ -37,7 +39,7 @@ class Snapshot:
         return (
             f'{file.path}: {file.vertices} vertices, {file.edges} edges, {file.faces} faces'
             f'{stride}, likelihood {self.likelihood[0]:.3g} to {self.likelihood[1]:.3g} '
-            '/ (px^2 m)')
+            '/ (px^2 m)' + (f'; {self.elsewhere}' if self.elsewhere else ''))
 
 
 def save_snapshot(

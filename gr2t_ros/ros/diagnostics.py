@@ -88,6 +88,10 @@ class Diagnostics:
             latency = worker.timings.percentile('stamp to publish', percent, _NEWEST)
             if latency is not None:
                 values[f'stamp to publish p{percent} (ms)'] = 1000 * latency
+        used, limit = worker.memory
+        values['memory of the map (MB)'] = 1e-6 * used
+        values['memory that it may have (MB)'] = 1e-6 * limit
+        values['keyframes that left memory'] = worker.parts.keyframes
         values['memory (MB)'] = _resident_mb()
         values['CPU of publishing (s)'] = worker.timings.total('publish, CPU')
         values['CPU of callbacks (s)'] = time.thread_time()

@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
 import threading
 import time
 import traceback
@@ -14,8 +16,10 @@ from typing import Any, Protocol
 from ..core import poses
 from ..core.frozen import room_for
 from ..core.reconstruction import Reconstruction, Update
+from ..core.release import limit_of, used_by
 from ..core.view import View
 from ..errors import FrameError, Gr2tError
+from ..io.parts import new_directory, Parts
 from ..io.snapshots import save_snapshot, Snapshot
 from ..settings import Settings
 from .intake import Intake
@@ -86,7 +90,8 @@ class Worker:
         self.busy = 0.0  # s
         self.explanations: dict[str, str] = {}  # of drops by the worker itself
         self._unseen: list[int] = []  # stamps of views that were not published yet
-        self._reconstruction = Reconstruction(settings)
+        self._parts = self._new_parts()
+        self._reconstruction = Reconstruction(settings, self._parts)
         self._in_map = 0  # views since the last reset
         self.waiting_rays = 0
         self._views: deque[View] = deque()
@@ -134,6 +139,16 @@ class Worker:
     def blocks(self) -> int:
         """Return the number of the lattice's blocks."""
         return self._reconstruction.blocks
+
+    @property
+    def parts(self) -> Parts:
+        """Return what left memory."""
+        return self._parts
+
+    @property
+    def memory(self) -> tuple[int, int]:
+        """Return the bytes of the map, and how many it may have; see max_memory_mb."""
+        return used_by(self._reconstruction), limit_of(self._settings)
 
     @property
     def alive(self) -> bool:
@@ -184,6 +199,8 @@ class Worker:
                 f'{camera.integrated} integrated, {dropped.total()} dropped'
                 f'{f" ({reasons})" if reasons else ""}, {camera.waiting} waiting')
         lines[-1] += f', {len(self._reconstruction.keyframes)} keyframes'
+        if self._parts.keyframes:
+            lines.append(str(self._parts))
         return '\n'.join([*lines, self.timings.table()])
 
     def _notify(self) -> None:
@@ -251,6 +268,7 @@ class Worker:
         except FrameError as error:
             self.intake.drop(view, error.reason)
             self._tell(error.reason, str(error))
+            self._account(self._reconstruction.finish(0.0))  # some may have been released
             return
         except Exception as error:  # costs this frame, not the others
             self.intake.drop(view, 'error')
@@ -271,7 +289,11 @@ class Worker:
 
     def _account(self, update: Update) -> None:
         self.waiting_rays = update.waiting
-        self._outputs.change(update.changed)
+        self._outputs.change((*update.changed, *update.released))
+        if update.released and self._parts.keyframes == len(update.released):
+            self._log.warning(
+                'memory is full (max_memory_mb): the keyframes farthest from the camera leave the '
+                f'display; finished, each becomes a PLY file in {self._parts.directory}')
         for notice in update.notices:
             self._log.info(notice)
 
@@ -330,15 +352,21 @@ class Worker:
         self, reconstruction: Reconstruction, interrupted: Callable[[], bool] = lambda: False
     ) -> Snapshot:
         with self.timings.measure('snapshot'):
-            return save_snapshot(
+            snapshot = save_snapshot(
                 reconstruction, self._settings.snapshot_directory, interrupted)
+        return replace(snapshot, elsewhere=str(self._parts))
+
+    def _new_parts(self) -> Parts:
+        return Parts(
+            lambda: new_directory(Path(self._settings.snapshot_directory).expanduser()))
 
     def _reset(self) -> None:
         for view in self._views:
             self.intake.drop(view, 'reset')
         self._views.clear()
         self._reconstruction.close()
-        self._reconstruction = Reconstruction(self._settings)
+        self._parts = self._new_parts()
+        self._reconstruction = Reconstruction(self._settings, self._parts)
         self._in_map = self._saved = 0
         self.waiting_rays = 0
         if self.intake.world.frame:

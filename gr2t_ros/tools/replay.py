@@ -17,10 +17,11 @@ from types import FrameType
 
 from ..core.reconstruction import Reconstruction, Update, warm_up
 from ..core.view import View
-from ..errors import FrameError, InputError
+from ..errors import FrameError, Gr2tError, InputError
 from ..io import topics
 from ..io.bags import Bag
 from ..io.frames import FrameAssembler
+from ..io.parts import emptied, Parts
 from ..io.views import views
 from ..settings import Settings
 from . import options, report
@@ -30,6 +31,7 @@ from .progress import Progress, say
 from .results import write_results
 
 _MAX_WAITING = 100  # images, while the recording has not come to their poses yet
+_PARTS = 'parts'  # folder of what left memory
 # parameters of no effect here
 _LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'use_mask',
          'reset_on_time_jump', 'queue_size',
@@ -100,8 +102,11 @@ def run(args: argparse.Namespace) -> int:
         say(f'  poses        {poses_text(sources.poses)}')
         say(_parameters(settings))
         say('preparing the kernels (the first run compiles them: about a minute) ...')
-        done = report.Run(settings, startup_seconds=warm_up(settings))
-        with closing(Reconstruction(settings)) as reconstruction:
+        parts = Parts(lambda: emptied(directory / _PARTS))
+        if (directory / _PARTS).is_dir():
+            emptied(directory / _PARTS)  # of a former run
+        done = report.Run(settings, startup_seconds=warm_up(settings), parts=parts)
+        with closing(Reconstruction(settings, parts)) as reconstruction:
             def write() -> None:
                 title = ' '.join(path.name for path in bag.paths)
                 print(write_results(
@@ -129,6 +134,7 @@ class _Replay:
         self._sources = sources
         self._reconstruction = reconstruction
         self._done = done
+        self._said = False
 
     def read(self) -> bool:
         """
@@ -180,6 +186,8 @@ class _Replay:
         try:
             update = self._reconstruction.add(view)
         except FrameError as error:
+            if error.reason == 'memory':
+                raise Gr2tError(str(error)) from error
             done.dropped[error.reason] += 1
             done.explanations.setdefault(error.reason, str(error))
             return
@@ -209,6 +217,10 @@ class _Replay:
         self._done.converged += update.converged
         for notice in update.notices:
             say(notice)
+        if update.released and not self._said:
+            self._said = True
+            say('memory is full (max_memory_mb): the keyframes farthest from the camera are '
+                f'finished, and go to {self._done.parts.directory}, a PLY file each')
 
     def _expected(self) -> int:
         """Return about how many frames there will be."""

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..io.files import whole_file
+from ..io.parts import Parts
 from ..settings import Settings
 
 STAGES = ('read', 'integrate', 'march', 'mesh', 'total')
@@ -26,12 +27,14 @@ class Run:
     """
     What is counted and timed while a recording is replayed.
 
+    :param parts: of the map that left memory
     :param seconds: of each of STAGES, once per frame in which the stage ran
     :param loop_seconds: wall time from the first read to the last frame done
     :param first_stamp_ns: of the images that were integrated; likewise last_stamp_ns
     """
 
     settings: Settings
+    parts: Parts
     read: int = 0
     integrated: int = 0
     keyframes: int = 0
@@ -54,7 +57,8 @@ def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[s
     """
     Return the content of report.json.
 
-    :param counts: vertices, edges and faces of the mesh that was written
+    :param counts: vertices, edges and faces of the mesh that was written; parts that left memory
+        before have their own
     :param likelihood: (n,) of its vertices
     """
     recorded = (run.last_stamp_ns - run.first_stamp_ns) * 1e-9
@@ -71,6 +75,8 @@ def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[s
         'realtime_factor': recorded / run.loop_seconds if run.loop_seconds else 0.0,
         'peak_memory_mb': peak_memory_mb(),
         'mesh': dict(counts),
+        'parts': {name: getattr(run.parts, name)
+                  for name in ('keyframes', 'vertices', 'edges', 'faces')},
         'likelihood': {
             'max': float(likelihood.max()) if some else 0.0,
             'p50': float(np.percentile(likelihood, 50)) if some else 0.0,

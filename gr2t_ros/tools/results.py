@@ -42,9 +42,14 @@ def write_results(
         results[str(written.path)] += (
             f'; decimated by {written.stride} in rows and columns, to at most {ply.MAX_FACES} '
             'faces')
+    if run.parts.directory:
+        results[str(written.path)] += f'; the {reconstruction.kept} keyframes still in memory'
+        results[str(run.parts.directory)] = (
+            f'the other {run.parts.keyframes} keyframes, finished, a file each: '
+            f'{run.parts.vertices} vertices, {run.parts.edges} edges, {run.parts.faces} faces')
     if per_view:
         meshes.write_other_views()
-        results[str(directory / 'views')] = f'{len(reconstruction.keyframes)} keyframes'
+        results[str(directory / 'views')] = f'{reconstruction.kept} keyframes'
     mesh = ply.read(written.path).mesh
     picture = directory / 'preview.png'
     preview(
@@ -96,7 +101,7 @@ class _Meshes:
     def _write_view(self, number: int, mesh: ViewMesh) -> None:
         def strided(stride: int) -> list[tuple[int, ViewMesh]]:
             return [(number, mesh if stride == 1 else self._reconstruction.mesh(number, stride))]
-        if self._views is not None:
+        if self._views is not None and not self._reconstruction.keyframes[number].released:
             ply.write_views(
                 self._views / f'view_{number:04d}.ply', strided, self.colouring)
             self._written.add(number)
