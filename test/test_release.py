@@ -162,6 +162,6 @@ def test_a_ray_s_bytes_are_those_of_its_arrays() -> None:
     with closing(Reconstruction(SETTINGS)) as reconstruction:
         reconstruction.add(along_a_wall(1)[0])
         rays: Rays = reconstruction.keyframes[0].rays
-        assert sum(
-            value.nbytes for name, value in vars(rays).items()
-            if name not in ('table', 'T_world_camera')) == BYTES_PER_RAY * len(rays.pixels)
+        each = [value.nbytes for name, value in vars(rays).items()
+                if name not in ('table', 'T_world_camera', 'rounds')]
+        assert sum(each) == BYTES_PER_RAY * len(rays.pixels)

@@ -8,8 +8,9 @@ whole, so no position is ever rounded. Block 0 is empty and stands for all that 
 """
 from __future__ import annotations
 
+from collections.abc import Callable
 import mmap
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from numba import int64, njit, uint64
 import numpy as np
@@ -61,6 +62,9 @@ class Blocks(NamedTuple):
     filtered: NDArray[np.int32]
 
 
+AnyBlocks = TypeVar('AnyBlocks', bound=Any)
+
+
 def new_blocks(capacity: int = 1024) -> Blocks:
     """Return a lattice that holds block 0 only."""
     table = 1 << (4 * capacity - 1).bit_length()
@@ -78,15 +82,18 @@ def _room(count: int) -> Floats:
 
 
 def with_keys(
-    blocks: Blocks, keys: NDArray[np.int64], change: int, most: int = NO_LIMIT
-) -> tuple[Blocks, NDArray[np.int32]]:
+    blocks: AnyBlocks, keys: NDArray[np.int64], change: int, most: int = NO_LIMIT,
+    new: Callable[[int], Any] = new_blocks,
+) -> tuple[AnyBlocks, NDArray[np.int32]]:
     """
     Make sure that blocks exist, growing by doubling, and mark them as changed.
 
+    :param blocks: Blocks, or a tuple that begins alike and has neighbour and touched
     :param keys: (n,) int64, in any order, repeated or not
     :param change: the number of the change, greater than all before
     :param most: where no more blocks than this are expected, the last doublings are one step: a
         lattice that grows is there twice, and what is reserved takes no memory before it is used
+    :param new: makes one that holds block 0 only, of a capacity
     :return: the lattice and the blocks' numbers, each once, in the order of the keys
     """
     found = np.zeros(len(keys), np.int32)
@@ -98,7 +105,7 @@ def with_keys(
         capacity = 2 * size
         if size < most <= _LAST_STEP * size:
             capacity = most
-        blocks = _grown(blocks._replace(size=size), capacity)
+        blocks = _grown(blocks._replace(size=size), new(capacity))
 
 
 def capacity_for(size: int) -> int:
@@ -118,13 +125,13 @@ def linked(blocks: Blocks, size: int) -> Blocks:
     return blocks._replace(size=size)
 
 
-def _grown(blocks: Blocks, capacity: int) -> Blocks:
-    grown = new_blocks(capacity)
+def _grown(blocks: AnyBlocks, grown: AnyBlocks) -> AnyBlocks:
     for name in blocks._fields[3:]:
         old = getattr(blocks, name)
         getattr(grown, name)[:len(old)] = old
     _rehash(grown.table_key, grown.table_block, grown.key, blocks.size)
-    return grown._replace(size=blocks.size)
+    larger: AnyBlocks = grown._replace(size=blocks.size)
+    return larger
 
 
 @njit(cache=True, nogil=True)
@@ -152,6 +159,15 @@ def place_of(key: np.int64) -> tuple[np.int64, np.int64, np.int64]:
     return (
         (key & _MASK) - _OFFSET, ((key >> _BITS) & _MASK) - _OFFSET,
         ((key >> (2 * _BITS)) & _MASK) - _OFFSET)
+
+
+@njit(cache=True, nogil=True)
+def places_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the block numbers (n, 3) of some keys."""
+    out = np.zeros((len(keys), 3), np.int64)
+    for n in range(len(keys)):
+        out[n, 0], out[n, 1], out[n, 2] = place_of(keys[n])
+    return out
 
 
 @njit(cache=True, nogil=True)

@@ -8,8 +8,9 @@ have a part in it. How these go together was fitted to simulated scans; docs/met
 """
 from __future__ import annotations
 
-from math import pi, sqrt
+from math import exp, log, pi, sqrt
 
+from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,20 +31,43 @@ def deviations(density: Density, rays: Rays, which: NDArray[np.int64]) -> Floats
     :param which: (n,) int64, indices of rays that have found their maximum
     :return: float32, metres of depth; infinite where the density is not curved downwards
     """
-    f = rays.total[which] / max(density.size, 1)
-    f2 = rays.curvature[which] / max(density.size, 1)
-    h3 = density.h3(rays.depth[which]).astype(np.float32)
-    width = np.sqrt(np.divide(-f, f2, out=np.full_like(f, np.inf), where=f2 < 0)) / h3
+    return deviations_and_agreements(density, rays, which)[0]
+
+
+def deviations_and_agreements(
+    density: Density, rays: Rays, which: NDArray[np.int64]
+) -> tuple[Floats, Floats]:
+    """
+    Return also which share of what the views that see a maximum can give it has.
+
+    :return: (n,) float32 as deviations, (n,) float32, about 1 on a plane that faces the views
+    """
+    h3 = density.h3(rays.depth[which])
     pixels = rays.table.shape[0] * rays.table.shape[1]
-    # a view's share where it sees a plane that faces it
-    share = 1.0 / (sqrt(2 * pi) * max(density.size, 1) * pixels * h3)
-    peak = density.expected_peak(rays.points(which)).astype(np.float32)
-    views = np.maximum(peak / share, 1.0)
-    agreement = f / (share * views)
-    with np.errstate(divide='ignore', invalid='ignore'):
-        sigma = h3 * _SCALE * _FITTED_AT / density.pixel_bandwidth * (
-            width ** _WIDTH * agreement ** _AGREEMENT * views ** _VIEWS)
-    return np.where(sigma >= 0, sigma, np.inf).astype(np.float32)
+    sigma, agreement = np.zeros((2, len(which)), np.float32)
+    # the factor 1/C is left out: what other views add elsewhere changes no digit
+    _deviations(
+        rays.total[which], rays.curvature[which], h3, 1.0 / (sqrt(2 * pi) * pixels * h3),
+        density.expected_total(rays.points(which)), _SCALE * _FITTED_AT / density.pixel_bandwidth,
+        sigma, agreement)
+    return sigma, agreement
+
+
+@njit(cache=True, nogil=True, error_model='numpy')
+def _deviations(
+    totals: Floats, curvatures: Floats, h3s: Doubles, shares: Doubles, expected: Doubles,
+    factor: float, sigma: Floats, agreement: Floats,
+) -> None:
+    """Write sigma and agreement; a share is what a view gives where it sees a plane facing it."""
+    for n in range(len(totals)):
+        views = np.float32(max(expected[n] / shares[n], 1.0))
+        agreement[n] = totals[n] / (shares[n] * views)
+        sigma[n] = np.inf
+        if curvatures[n] < 0 and agreement[n] > 0:
+            square = np.float32(-totals[n] / (curvatures[n] * h3s[n] * h3s[n]))  # of the width
+            sigma[n] = h3s[n] * factor * exp(
+                np.float32(0.5 * _WIDTH) * log(square)
+                + np.float32(_AGREEMENT) * log(agreement[n]) + np.float32(_VIEWS) * log(views))
 
 
 def confidences(sigma: Floats, h3: Doubles) -> Floats:

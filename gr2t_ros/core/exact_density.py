@@ -227,16 +227,16 @@ class ExactDensity:
             for i in range(0, len(points), _CHUNK)])
         return out / max(self._views.size, 1)
 
-    def expected_peak(self, points: Doubles) -> Doubles:
+    def expected_total(self, points: Doubles) -> Doubles:
         """
-        Return what the likelihood would be on a plane that faces the views which see a point.
+        Return C times the likelihood of a plane that faces the views which see a point.
 
         :param points: (n, 3) float64, world, metres
         :return: (n,) float64, 1 / (px^2 m); 0 where no view sees the point
         """
         out = np.zeros(len(points))
         _sum_expected(self.state, self.bandwidth, points, out)
-        return out / max(self._views.size, 1)
+        return out
 
     def along(
         self, origins: Doubles, directions: Doubles, distances: Doubles

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from copy import copy
+from dataclasses import dataclass, field
 from types import ModuleType
 
 from numba import njit
@@ -49,6 +50,8 @@ class Rays:
     :param status: (n,) uint8, Status
     :param iterations: (n,) uint8: evaluations of the density
     :param marched: (n,) int32: the density's change up to which the ray is right
+    :param marches: (n,) uint16: how often it was marched, modulo 2^16
+    :param rounds: how often some of them were
     """
 
     pixels: NDArray[np.int32]
@@ -61,6 +64,12 @@ class Rays:
     status: NDArray[np.uint8]
     iterations: NDArray[np.uint8]
     marched: NDArray[np.int32]
+    marches: NDArray[np.uint16] = field(init=False)
+    rounds: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.marches = (self.iterations > 0).astype(np.uint16)
+        self.rounds = int(self.marches.any())
 
     @property
     def converged(self) -> NDArray[np.bool_]:
@@ -69,10 +78,12 @@ class Rays:
 
     def copy(self) -> Rays:
         """Return rays with results of their own."""
-        return replace(
-            self, depth=self.depth.copy(), total=self.total.copy(),
-            curvature=self.curvature.copy(), status=self.status.copy(),
-            iterations=self.iterations.copy(), marched=self.marched.copy())
+        own = copy(self)
+        own.depth, own.total = self.depth.copy(), self.total.copy()
+        own.curvature, own.status = self.curvature.copy(), self.status.copy()
+        own.iterations, own.marched = self.iterations.copy(), self.marched.copy()
+        own.marches = self.marches.copy()
+        return own
 
     @property
     def origin(self) -> Doubles:
@@ -167,6 +178,8 @@ def march(
             rays.T_world_camera, rays.start, rays.depth, rays.total, rays.curvature,
             rays.status, rays.iterations))
     rays.marched[which] = density.change
+    rays.marches[which] += np.uint16(1)
+    rays.rounds += 1
 
 
 def stale(

@@ -25,8 +25,9 @@ from .blocks import linked, new_blocks, with_keys
 from .camera import Camera
 from .colour import Colouring
 from .colour_scale import robust_maximum
-from .exact_density import ExactDensity
 from .frozen import ASKING, frozen, Room
+from .fused_mesh import FusedMap, MIN_COMPONENT, Region, SurfaceMesh
+from .new_density import aliasing, new_density
 from .poses import step
 from .ray_march import Density, march, Rays, rays_of, stale, watched_blocks
 from .release import MemoryBound, Sink
@@ -36,7 +37,6 @@ from .view_mesh import view_mesh, ViewMesh
 from .voxel_density import VoxelDensity
 
 _SLICE = 65536  # rays marched between two looks at the clock
-_ALIASED = 0.05  # share of pixels too near for the voxel size that is worth a notice
 
 
 @dataclass(eq=False)
@@ -110,6 +110,7 @@ class Reconstruction:
         self.sink = sink
         self._bound = MemoryBound()
         self._density: Density | None = None
+        self._fused = FusedMap()
         self._noticed: set[str] = set()
         self._pool: Executor | None = ThreadPoolExecutor(
             settings.threads or os.cpu_count() or 1, thread_name_prefix='gr2t')
@@ -168,11 +169,12 @@ class Reconstruction:
             self._bound.make_room(self, view, wanted)
         made_room = perf_counter()
         if self._density is None:
-            self._density, notice = self._new_density(view)
+            self._density, notice = new_density(self.settings, view)
             notices += [notice] if notice else []
         self._density.add(view, self._pool)
         self.stamp_ns = max(self.stamp_ns, view.stamp_ns)
-        notices += self._notice_aliasing(view)
+        if 'aliasing' not in self._noticed:
+            notices += self._once('aliasing', aliasing(self._density, view))
         number = None
         if wanted and self.kept < self.settings.max_keyframes:
             number = len(self.keyframes)
@@ -216,6 +218,40 @@ class Reconstruction:
         for number in range(len(self.keyframes)):
             yield number, self.mesh(number, stride)
 
+    def fuse(self) -> list[Region]:
+        """
+        Bring the fused map up to date with the rays as they are, marched or waiting.
+
+        The first call makes it from all keyframes; none is made for those who do not ask.
+
+        :return: the regions whose mesh may have changed since the last call
+        """
+        return self._fused.update(
+            self._density, [(keyframe.view, keyframe.rays) for keyframe in self.keyframes],
+            self.settings, self._pool)
+
+    @property
+    def fused_regions(self) -> list[Region]:
+        """Return all regions of the fused map, as it was fused last."""
+        return self._fused.regions
+
+    def fused_region(self, region: Region) -> SurfaceMesh:
+        """
+        Return the fused mesh in a region, as it was fused last.
+
+        Each triangle is in one region, the vertices at their borders are in several.
+        """
+        return self._fused.mesh(self._density, self._pool, region=region)
+
+    def fused_mesh(self, min_component: int = MIN_COMPONENT) -> SurfaceMesh:
+        """
+        Return the fused mesh of the whole map, brought up to date.
+
+        :param min_component: triangles; connected parts that have fewer are left out
+        """
+        self.fuse()
+        return self._fused.mesh(self._density, self._pool, min_component)
+
     def colouring(self) -> Colouring:
         """Return how points are coloured, up to the robust maximum over all keyframes."""
         density = self._density
@@ -235,6 +271,7 @@ class Reconstruction:
         """
         twin = copy(self)
         twin._pool, twin._bound, twin.sink = None, MemoryBound(), None
+        twin._fused = FusedMap()  # it is made again from the same rays, where it is wanted
         if self._density is not None:
             self._density.refresh(self._pool)
             twin._density = frozen(self._density, room, fields)
@@ -251,28 +288,6 @@ class Reconstruction:
         """End the threads."""
         if self._pool is not None:
             self._pool.shutdown()
-
-    def _new_density(self, view: View) -> tuple[Density, str]:
-        """Return an empty density for the first view, and what to say of it."""
-        s = self.settings
-        if s.density == 'exact':
-            return ExactDensity(
-                s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic), ''
-        voxel_size, notice = s.voxel_size, ''
-        if voxel_size == 0:
-            seen = view.depth[np.isfinite(view.depth)]
-            if not len(seen):
-                raise FrameError(
-                    'no_valid_depth', 'the first depth image has no valid depth to choose a '
-                    'voxel size from; the next one may')
-            median = float(np.median(seen))
-            voxel_size = s.depth_bandwidth + s.depth_bandwidth_quadratic * median ** 2
-            notice = (
-                f'voxel_size is {1000 * voxel_size:.3g} mm: h3 at the first frame\'s median '
-                f'depth of {median:.2f} m')
-        return VoxelDensity(
-            s.pixel_bandwidth, s.depth_bandwidth, s.depth_bandwidth_quadratic, voxel_size,
-            s.depth_max), notice
 
     def _new_keyframe(self, view: View) -> Keyframe:
         rays = rays_of(
@@ -347,31 +362,11 @@ class Reconstruction:
         newest = len(self.keyframes) - 1
         return sorted(shares, key=lambda n: (n != newest, -shares[n], -n))
 
-    def _notice_aliasing(self, view: View) -> list[str]:
-        density = self.density
-        if 'aliasing' in self._noticed or not isinstance(density, VoxelDensity) or (
-                density.aliased_pixels <= _ALIASED * density.pixels):
-            return []
-        if not np.isfinite(view.depth).any():
-            return []
-        near = float(np.nanpercentile(view.depth, 5))
-        fitting = density.finest_voxel(near, view.camera)
-        return self._once(
-            'aliasing', f'{density.aliased_pixels / density.pixels:.0%} of the pixels are too '
-            f'near for voxels of {1000 * density.voxel_size:.3g} mm: detail smaller than that is '
-            f'lost there; voxel_size:={_rounded_down(fitting):g} would keep it')
-
     def _once(self, topic: str, sentence: str) -> list[str]:
-        if topic in self._noticed:
+        if not sentence or topic in self._noticed:
             return []
         self._noticed.add(topic)
         return [sentence]
-
-
-def _rounded_down(value: float) -> float:
-    """Return a positive number with two digits, not above it."""
-    digit = 10.0 ** (np.floor(np.log10(value)) - 1)
-    return float(np.floor(value / digit) * digit)
 
 
 def warm_up(settings: Settings) -> float:
@@ -392,6 +387,7 @@ def warm_up(settings: Settings) -> float:
     for _, mesh in tiny.meshes():
         triangle_corners(
             mesh.vertices, mesh.faces, np.zeros(mesh.vertices.shape, np.uint8), shading=True)
+    tiny.fused_mesh()
     tiny.close()
     blocks, _ = with_keys(new_blocks(1), np.arange(2), 1)  # it grows: the tiny map did not
     without(blocks, np.zeros(blocks.size, np.bool_), 1)

@@ -34,7 +34,7 @@ Sink = Callable[[int, 'ViewMesh', Colouring], None]
 _SLOTS = 4 * (8 + 4)  # bytes of the hash for a block, at least
 # with what a snapshot copies of it, see frozen.py
 _BYTES = BYTES_PER_BLOCK + _SLOTS + (BYTES_PER_BLOCK - 4 * VOXELS)
-BYTES_PER_RAY = 26
+BYTES_PER_RAY = 28
 _AT_WORK = 8  # keyframes, the newest, that are never released
 _RECENT = 50  # changes: blocks that a view touched since then stay
 _PAUSE = 5.0  # s before a sink that failed is tried again
@@ -157,7 +157,7 @@ def _empty(keyframe: Keyframe) -> None:
     keyframe.view = replace(keyframe.view, depth=np.zeros((0, 0), np.float32))
     keyframe.rays = replace(keyframe.rays, **{
         item.name: getattr(keyframe.rays, item.name)[:0].copy() for item in fields(Rays)
-        if item.name not in ('table', 'T_world_camera')})
+        if item.init and item.name not in ('table', 'T_world_camera')})
     if keyframe.blocks is not None:
         keyframe.blocks = keyframe.blocks[:0].copy()
 

@@ -185,11 +185,11 @@ class VoxelDensity:
             for i in range(0, len(points), _POINTS)])
         return found[:, 0] / max(self.size, 1)
 
-    def expected_peak(self, points: Doubles) -> Doubles:
+    def expected_total(self, points: Doubles) -> Doubles:
         """
-        Return what the likelihood would be on a plane that faces the views which see a point.
+        Return C times the likelihood of a plane that faces the views which see a point.
 
-        1/C times the sum over those views of 1 / (N_c sqrt(2 pi) h3), at the nearest voxel: the
+        The sum over those views of 1 / (N_c sqrt(2 pi) h3), at the nearest voxel: C times the
         likelihood over it depends neither on the cameras nor on how often a place was seen.
 
         :param points: (n, 3) float64, world, metres
@@ -197,8 +197,7 @@ class VoxelDensity:
         """
         return lattice.values_at(
             self.blocks, self.blocks.expected,
-            np.round(np.asarray(points, np.float64) / self.voxel_size).astype(np.int64)
-        ) / max(self.size, 1)
+            np.round(np.asarray(points, np.float64) / self.voxel_size).astype(np.int64))
 
     def along(
         self, origins: Doubles, directions: Doubles, distances: Doubles

@@ -1,0 +1,166 @@
+# Copyright 2026 The gr2t_ros developers
+# SPDX-License-Identifier: Apache-2.0
+"""
+One mesh out of all keyframes.
+
+Every keyframe's maxima are a depth image without noise. On a grid about them, each voxel averages
+its distances to the keyframes' surfaces, weighted by how well the maxima agree with the views and
+how much they face their camera; the mesh is where the average is zero.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+from numba import njit
+import numpy as np
+from numpy.typing import NDArray
+
+from ..settings import Settings
+from .blocks import key_of, place_of, places_of, with_keys
+from .compiled import run_all
+from .fused_grid import Grid, new_grid, sum_blocks, Views, views_of
+from .fused_surface import surface, without_islands
+from .fused_view import Bandwidth, FusedView, spread
+from .new_density import voxel_size_for
+from .ray_march import Density, Rays
+from .view import View
+from .voxel_density import VoxelDensity
+
+Doubles = NDArray[np.float64]
+Region = tuple[int, int, int]
+
+REGION = 8  # blocks; side of a region
+MIN_COMPONENT = 50  # triangles
+_BLOCKS = 64  # a task
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceMesh:
+    """
+    A triangle mesh of several views' surface.
+
+    :param vertices: (n, 3) float64, world, metres
+    :param vertex_likelihood: (n,) float32, 1 / (px^2 m)
+    :param vertex_sigma: (n,) float32, standard deviation across the surface, metres
+    :param vertex_confidence: (n,) float32, 0 to 1
+    :param vertex_views: (n,) int32, how many keyframes support the vertex
+    :param faces: (m, 3) int32, indices of vertices, anticlockwise seen from outside
+    """
+
+    vertices: Doubles
+    vertex_likelihood: NDArray[np.float32]
+    vertex_sigma: NDArray[np.float32]
+    vertex_confidence: NDArray[np.float32]
+    vertex_views: NDArray[np.int32]
+    faces: NDArray[np.int32]
+
+
+_NONE = np.zeros(0, np.float32)
+_EMPTY = SurfaceMesh(
+    np.zeros((0, 3)), _NONE, _NONE, _NONE, np.zeros(0, np.int32), np.zeros((0, 3), np.int32))
+
+
+class FusedMap:
+    """
+    The fused map of a reconstruction, empty at first.
+
+    The same keyframes give the same map, bit for bit, whichever way it came about.
+    """
+
+    def __init__(self) -> None:
+        self._voxel = 0.0  # metres, as the first update has it
+        self._min_confidence = 0.0
+        self._images: dict[View, FusedView] = {}
+        self._grid = new_grid()
+        self._change = 0
+
+    @property
+    def regions(self) -> list[Region]:
+        """Return the regions that may have a mesh."""
+        return _unique(_regions_of(self._grid.key[1:self._grid.size]))
+
+    def update(
+        self, density: Density | None, keyframes: Sequence[tuple[View, Rays]],
+        settings: Settings, pool: Executor | None,
+    ) -> list[Region]:
+        """
+        Take in what was marched since the last time.
+
+        :param keyframes: all of them, in a fixed order; those without rays do not count
+        :return: the regions whose mesh may have changed, each once
+        """
+        keyframes = [(view, rays) for view, rays in keyframes if len(rays.pixels)]
+        if density is None or not keyframes:
+            return []
+        if self._voxel == 0:
+            self._voxel = (
+                density.voxel_size if isinstance(density, VoxelDensity)
+                else voxel_size_for(settings, keyframes[0][0])[0])
+        if settings.min_confidence != self._min_confidence:
+            self._min_confidence = settings.min_confidence
+            for image in self._images.values():
+                image.forget()
+        self._images = {
+            view: self._images.get(view) or FusedView(view.camera, settings.ray_stride)
+            for view, _ in keyframes}
+        keys = run_all(pool, FusedView.update, [
+            (self._images[view], density, rays, self._min_confidence, self._voxel)
+            for view, rays in keyframes if self._images[view].rounds != rays.rounds])
+        if not keys:
+            return []
+        self._change += 1
+        self._grid, dirty = with_keys(
+            self._grid, np.concatenate(keys), self._change, new=new_grid)
+        run_all(pool, sum_blocks, [
+            (self._grid, dirty[i:i + _BLOCKS], *self._seen(density))
+            for i in range(0, len(dirty), _BLOCKS)])
+        return _unique(_regions_of(_before(self._grid, dirty)))
+
+    def mesh(
+        self, density: Density | None, pool: Executor | None,
+        min_component: int = MIN_COMPONENT, region: Region | None = None,
+    ) -> SurfaceMesh:
+        """
+        Return the mesh of all regions, joined, or of one.
+
+        :param min_component: triangles; parts that have fewer are left out, but for those that
+            may go on in another region
+        """
+        blocks = np.arange(1, self._grid.size, dtype=np.int32)
+        if density is None or len(blocks) == 0:
+            return _EMPTY
+        if region is not None:
+            blocks = blocks[(_regions_of(self._grid.key[blocks]) == region).all(axis=1)]
+        found = without_islands(
+            surface(self._grid, blocks, *self._seen(density), pool), min_component)
+        return SurfaceMesh(
+            found.vertices, density.likelihood(found.vertices, pool).astype(np.float32),
+            found.sigma, found.confidence, found.views, found.faces)
+
+    def _seen(self, density: Density) -> tuple[Views, Bandwidth, Bandwidth, float]:
+        """Return what the kernels need of the keyframes."""
+        return (
+            views_of(self._images), density.bandwidth, spread(density.bandwidth, self._voxel),
+            self._voxel)
+
+
+def _regions_of(keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the regions (n, 3) of blocks with some keys."""
+    return places_of(keys) // REGION
+
+
+def _unique(regions: NDArray[np.int64]) -> list[Region]:
+    return [(x, y, z) for x, y, z in np.unique(regions, axis=0).tolist()]
+
+
+@njit(cache=True, nogil=True)
+def _before(grid: Grid, blocks: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the keys of some blocks and those whose cells reach into them, with repetitions."""
+    out = np.zeros(8 * len(blocks), np.int64)
+    for n in range(len(blocks)):
+        x, y, z = place_of(grid.key[blocks[n]])
+        for m in range(8):
+            out[8 * n + m] = key_of(x - (m & 1), y - (m >> 1 & 1), z - (m >> 2))
+    return out
