@@ -158,12 +158,19 @@ class Settings:
         True, 'Faces of the published meshes turned away from a light are darker, since viewers '
         'do not light coloured meshes; the saved ones keep pure colours.', live=True)
     snapshot_directory: str = _parameter(
-        '~/gr2t_snapshots', 'Folder of the PLY snapshots; made when needed.', live=True)
+        '~/gr2t_snapshots', 'Folder of the snapshots (PLY) and maps, which are written nowhere '
+        'else; made when needed.')
     snapshot_period: float = _parameter(
         0.0, 'Also save a snapshot so often, where the map has changed; 0: never.',
         unit='s', low=0.0, high=86400.0, live=True)
     snapshot_on_exit: bool = _parameter(
         False, 'Also save a snapshot when the node is told to stop.', live=True)
+    map_period: float = _parameter(
+        0.0, 'Also save the map so often, where it has changed, and when the node is told to '
+        'stop; 0: never.', unit='s', low=0.0, high=86400.0, live=True)
+    map_file: str = _parameter(
+        '', 'Name of the file in snapshot_directory that ~/load_map reads; empty: the newest map.',
+        live=True)
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -229,6 +229,35 @@ def test_sigint_in_the_middle_of_a_snapshot(
                 assert answer.success or 'told to stop' in answer.message
 
 
+def test_a_map_outlives_a_node_that_is_killed(
+    isolation: Isolation, observer: Observer, bag: Path, tmp_path: Path
+) -> None:
+    """The next one loads it, publishes it, and goes on."""
+    with NodeProcess(isolation, tmp_path, '-p', 'map_period:=0.01') as node:
+        assert 'there is no map in' in observer.call(Trigger, 'load_map').message
+        isolation.play(bag)
+        observer.spin_until(
+            lambda: f'{FRAMES} views' in observer.call(Trigger, 'save_map').message, 'all views')
+        node.stop(signal.SIGKILL)
+    path, = node.snapshots.glob('*.gr2t')
+    with NodeProcess(isolation, tmp_path, '-p', 'publish_rate:=10.0') as node:
+        answer = observer.call(Trigger, 'load_map')
+        assert answer.success and answer.message.startswith(f'{path}: {FRAMES} views')
+        clouds = observer.collect(PointCloud2, '/gr2t/points', outputs_profile(10))
+        observer.spin_until(lambda: clouds, 'the loaded map as points')
+        _check_cloud(deserialize_message(clouds[-1], PointCloud2))
+        isolation.play(bag)
+        observer.spin_until(
+            lambda: f'{2 * FRAMES} views' in observer.call(Trigger, 'save_map').message,
+            'more views')
+        assert len(list(node.snapshots.glob('*.gr2t'))) == 2
+        elsewhere = Parameter(name='snapshot_directory', value=ParameterValue(
+            type=ParameterType.PARAMETER_STRING, string_value='/'))
+        answer = observer.call(SetParameters, 'set_parameters', parameters=[elsewhere])
+        assert 'is read at the start' in answer.results[0].reason
+        assert node.stop() == 0
+
+
 def test_a_signal_before_any_input(isolation: Isolation, tmp_path: Path) -> None:
     with NodeProcess(isolation, tmp_path) as node:
         assert node.stop(signal.SIGTERM) == 0

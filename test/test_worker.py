@@ -6,133 +6,36 @@ from dataclasses import replace
 from pathlib import Path
 import re
 import threading
-import time
 from typing import Any
 
 import numpy as np
 import pytest
-from scenes_for_tests import looking_at_origin, plane_view, pose
+from scenes_for_tests import plane_view, pose
+from worker_for_tests import COUNT, LIMIT, record_plane, Rig, workers
 
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.reconstruction import Reconstruction, Update
 from gr2t_ros.core.view import View
 from gr2t_ros.errors import Gr2tError, InputError
 from gr2t_ros.io import snapshots
-from gr2t_ros.io.bags import Bag
 from gr2t_ros.io.ply import read, write_views, Written
-from gr2t_ros.ros.worker import Worker
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
 
-LIMIT = 60.0  # s
-COUNT = 5
 WALL = 14  # frames
-
-
-class Outputs:
-    """Remembers what it is told."""
-
-    def __init__(self) -> None:
-        self.changed: set[int] = set()
-        self.published: list[tuple[str, int, int]] = []
-        self.cleared: list[str] = []
-
-    def change(self, keyframes: Any) -> None:
-        self.changed.update(keyframes)
-
-    def publish(
-        self, reconstruction: Reconstruction, frame_id: str, stamp_ns: int, views: int
-    ) -> bool:
-        self.published.append((frame_id, stamp_ns, views))
-        return True
-
-    def clear(self, frame_id: str) -> None:
-        self.cleared.append(frame_id)
-
-    def update(self, settings: Settings) -> None:
-        self.settings = settings
-
-
-class Log:
-    """Keeps lines."""
-
-    def __init__(self) -> None:
-        self.lines: list[str] = []
-        self.info = self.warning = self.error = self.lines.append
-
-
-class Rig:
-    """A worker with its outputs, and the messages of a recording."""
-
-    def __init__(self, bag: Path, settings: Settings) -> None:
-        self.outputs = Outputs()
-        self.log = Log()
-        self.worker = Worker(settings, self.outputs, self.log, rectified={'': True})
-        with Bag([bag]) as opened:
-            self.messages = [
-                (topic, message) for topic, message, _ in opened.messages(opened.topics)]
-
-    @property
-    def integrated(self) -> int:
-        return self.worker.intake.cameras[''].integrated
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        return self.worker.intake.cameras[''].dropped
-
-    def feed(self, *topics: str) -> None:
-        """Hand over all messages of these topics; of all where none is named."""
-        hands: dict[str, Callable[[Any], None]] = {
-            DEPTH_TOPIC: self.worker.intake.on_depth,
-            CAMERA_INFO_TOPIC: self.worker.intake.on_camera_info,
-            '/tf': lambda message: self.worker.intake.on_transforms(message, static=False),
-            '/tf_static': lambda message: self.worker.intake.on_transforms(message, static=True)}
-        for topic, message in self.messages:
-            if topic in (topics or hands):
-                hands[topic](message)
-
-    def wait(self, condition: Callable[[], Any], what: str) -> None:
-        end = time.monotonic() + LIMIT
-        while not condition():
-            assert time.monotonic() < end, f'waited in vain for {what}: {self.log.lines}'
-            time.sleep(0.005)
-
-    def said(self, text: str) -> int:
-        """Return how often a line with such a text was logged."""
-        return sum(text in line for line in self.log.lines)
 
 
 @pytest.fixture(scope='module')
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a recording of a plane."""
-    camera = Camera(48, 36, 45.0, 45.0, 23.5, 17.5)
-    path = tmp_path_factory.mktemp('bags') / 'plane'
-    record(path, [
-        replace(
-            plane_view(
-                camera, looking_at_origin((np.cos(i / 3), np.sin(i / 3), 2), 0.6), (0, 0, 1), 0.0),
-            stamp_ns=1_700_000_000_000_000_000 + i * 100_000_000)
-        for i in range(COUNT)])
-    return path
+    return record_plane(tmp_path_factory.mktemp('bags') / 'plane')
 
 
 @pytest.fixture
 def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
     """Return a function that makes a running worker with some parameters."""
-    rigs = []
-
-    def rig(start: bool = True, bag: Path = bag, **values: object) -> Rig:
-        settings = Settings().updated({
-            'publish_rate': 60.0, 'snapshot_directory': str(tmp_path / 'snapshots'), **values})
-        rigs.append(Rig(bag, settings))
-        if start:
-            rigs[-1].worker.start()
-        return rigs[-1]
-
-    yield rig
-    for item in rigs:
-        if item.worker.alive:
-            item.worker.stop()
+    with workers(bag, tmp_path / 'snapshots') as make:
+        yield make
 
 
 def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> None:
@@ -200,11 +103,11 @@ def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.worker.reset()
     with pytest.raises(InputError, match='nothing to save'):
-        rig.worker.snapshot().result(LIMIT)
+        rig.worker.saver.snapshot().result(LIMIT)
     assert rig.outputs.cleared == ['map']
     rig.feed()
     rig.wait(lambda: rig.integrated == 2 * COUNT, 'the frames after the reset')
-    assert rig.worker.snapshot().result(LIMIT).file.vertices > 0
+    assert rig.worker.saver.snapshot().result(LIMIT).file.vertices > 0
 
 
 def test_reset_and_pause_do_not_wait_for_a_frame(
@@ -224,7 +127,7 @@ def test_reset_and_pause_do_not_wait_for_a_frame(
     assert busy.wait(LIMIT)
     rig.worker.reset()
     rig.worker.intake.pause(True)
-    answer = rig.worker.snapshot()
+    answer = rig.worker.saver.snapshot()
     go.set()
     with pytest.raises(InputError, match='nothing to save'):
         answer.result(LIMIT)
@@ -236,7 +139,7 @@ def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path)
     rig = make()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
-    paths = [rig.worker.snapshot().result(LIMIT).file.path for _ in range(3)]
+    paths = [rig.worker.saver.snapshot().result(LIMIT).file.path for _ in range(3)]
     assert len(set(paths)) == 3
     for path in paths:
         assert path.parent == tmp_path / 'snapshots'
@@ -258,7 +161,7 @@ def test_no_frame_waits_for_a_snapshot(
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     monkeypatch.setattr(snapshots, 'write_views', slow)
-    answer, later = rig.worker.snapshot(), rig.worker.snapshot()
+    answer, later = rig.worker.saver.snapshot(), rig.worker.saver.snapshot()
     assert busy.wait(LIMIT)
     rig.feed()
     rig.wait(lambda: rig.integrated == 2 * COUNT, 'frames during the snapshot')
@@ -290,7 +193,7 @@ def test_a_stop_gives_up_what_is_being_written(
     rig = make()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
-    answers = [rig.worker.snapshot(), rig.worker.snapshot()]
+    answers = [rig.worker.saver.snapshot(), rig.worker.saver.snapshot()]
     assert busy.wait(LIMIT)
     rig.worker.stop()
     for answer in answers:
@@ -306,7 +209,7 @@ def test_periodic_snapshots_of_what_is_new(make: Callable[..., Rig], tmp_path: P
     rig.wait(lambda: rig.said('periodic snapshot'), 'a snapshot')
     rig.feed()
     rig.wait(lambda: rig.integrated == 2 * COUNT, 'more frames')
-    rig.wait(lambda: rig.worker._saved == 2 * COUNT, 'a snapshot of them')
+    rig.wait(lambda: rig.worker.saver._snapshots.saved == (1, 2 * COUNT), 'a snapshot of them')
     rig.worker.stop()
     assert rig.said('periodic snapshot') <= 2 * COUNT, 'none without new frames'
     assert rig.said('periodic snapshot: /') == len(list(tmp_path.glob('snapshots/*.ply')))
@@ -343,7 +246,7 @@ def test_a_folder_that_cannot_be_made_is_named(make: Callable[..., Rig], tmp_pat
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     with pytest.raises(Exception, match='file/inside'):
-        rig.worker.snapshot().result(LIMIT)
+        rig.worker.saver.snapshot().result(LIMIT)
 
 
 def test_images_whose_pose_never_comes_are_given_up(make: Callable[..., Rig]) -> None:
@@ -381,7 +284,7 @@ def test_what_leaves_memory_is_in_the_snapshots_folder(
     assert rig.said(f'finished, each becomes a PLY file in {folder}') == 1
     views = [set(read(path).vertex_view) for path in sorted(folder.iterdir())]
     assert views == [{number} for number in range(WALL - 9)]
-    saved = rig.worker.snapshot().result(LIMIT)
+    saved = rig.worker.saver.snapshot().result(LIMIT)
     assert set(read(saved.file.path).vertex_view) == set(range(WALL - 9, WALL))
     assert f'; {WALL - 9} keyframes that left memory are in {folder}: ' in str(saved)
     used, limit = rig.worker.memory
@@ -405,7 +308,7 @@ def test_frames_are_refused_where_nothing_can_leave_memory(
     rig.feed()
     rig.wait(lambda: rig.dropped.get('memory') == WALL - 9, 'the others to be refused')
     assert rig.integrated == 9
-    assert 'cannot make the folder' in rig.worker.explanations['memory']
+    assert 'cannot write to' in rig.worker.explanations['memory']
     assert rig.said('[memory: said once, then counted]') == 1
 
 

@@ -127,6 +127,11 @@ class Reconstruction:
         return self._density
 
     @property
+    def views(self) -> int:
+        """Return the number of views that were added."""
+        return self._density.size if self._density is not None else 0
+
+    @property
     def pool(self) -> Executor | None:
         """Return the threads; None: it works in the caller's."""
         return self._pool

@@ -147,32 +147,26 @@ def _density_state(density: Density) -> tuple[dict[str, Any], dict[str, list[NDA
         f'view_{name}': [getattr(views, name)[:used[name]]] for name in used}
 
 
-def restored(
-    settings: Settings, numbers: Mapping[str, Any], columns: Columns
-) -> Reconstruction:
+def restore(
+    reconstruction: Reconstruction, numbers: Mapping[str, Any], columns: Columns
+) -> None:
     """
-    Return the reconstruction that was saved.
+    Make an empty reconstruction what the saved one was.
 
-    :param settings: with the FIXED ones of the saved settings; voxel_size may be 0
+    :param reconstruction: its settings have the FIXED ones of the saved; voxel_size may be 0
     :param numbers: of State
     :raises InputError: if the state contradicts itself: kernels would read beyond their arrays
     """
     try:
         cameras = [_camera(item) for item in numbers['cameras']]
-        reconstruction = Reconstruction(settings)
-        try:
-            if settings.density == 'voxel':
-                density: Density = _voxel_density(settings, numbers, columns, reconstruction)
-            else:
-                density = _exact_density(settings, numbers, columns)
-            reconstruction.restore(
-                density, list(_keyframes(density, cameras, columns)), int(numbers['stamp_ns']))
-        except BaseException:
-            reconstruction.close()
-            raise
+        if reconstruction.settings.density == 'voxel':
+            density: Density = _voxel_density(reconstruction, numbers, columns)
+        else:
+            density = _exact_density(reconstruction.settings, numbers, columns)
+        reconstruction.restore(
+            density, list(_keyframes(density, cameras, columns)), int(numbers['stamp_ns']))
     except (KeyError, TypeError, ValueError, IndexError, OverflowError, FrameError) as error:
         raise InputError(f'its content contradicts itself ({error})') from error
-    return reconstruction
 
 
 def _camera(item: Mapping[str, Any]) -> tuple[Camera, str, str]:
@@ -183,9 +177,9 @@ def _camera(item: Mapping[str, Any]) -> tuple[Camera, str, str]:
 
 
 def _voxel_density(
-    settings: Settings, numbers: Mapping[str, Any], columns: Columns,
-    reconstruction: Reconstruction,
+    reconstruction: Reconstruction, numbers: Mapping[str, Any], columns: Columns
 ) -> VoxelDensity:
+    settings = reconstruction.settings
     density = VoxelDensity(
         settings.pixel_bandwidth, settings.depth_bandwidth, settings.depth_bandwidth_quadratic,
         float(numbers['voxel_size']), float(numbers['depth_max']))

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.reconstruction import Reconstruction
-from ..core.state import columns_of, FIXED, Kind, restored, state_of
+from ..core.state import columns_of, FIXED, Kind, restore, state_of
 from ..errors import Gr2tError, InputError
 from ..settings import Settings
 from .files import whole_file
@@ -168,12 +168,14 @@ class MapFile:
             raise InputError('it became shorter while it was read')
         return rows
 
-    def load(self, settings: Settings) -> Reconstruction:
+    def load(self, reconstruction: Reconstruction) -> None:
         """
-        Return the map, to go on with other settings than it was saved with, but for the FIXED.
+        Make an empty reconstruction the saved one.
 
+        :param reconstruction: its settings may differ from the saved ones, but for the FIXED
         :raises InputError: naming the settings that differ, or what is wrong with the content
         """
+        settings = reconstruction.settings
         differing = []
         for name in FIXED:
             ours, theirs = getattr(settings, name), getattr(self.settings, name)
@@ -188,7 +190,7 @@ class MapFile:
                 f'cannot go on with the map {self.path}: {", ".join(differing)}; set what the map '
                 'was built with')
         try:
-            return restored(settings, self._numbers, self)
+            restore(reconstruction, self._numbers, self)
         except OSError as error:
             raise InputError(
                 f'cannot read the map {self.path}: {error.strerror or error}') from error

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 import time
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from ..core.reconstruction import Reconstruction
 from ..core.view_mesh import ViewMesh
 from ..errors import Gr2tError, InputError
+from .files import Folder
 from .ply import write_views, Written
 
 _STEP = 0.2  # s of marching between two looks at whether to go on
@@ -43,7 +43,7 @@ class Snapshot:
 
 
 def save_snapshot(
-    reconstruction: Reconstruction, directory: str,
+    reconstruction: Reconstruction, folder: Folder,
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Snapshot:
     """
@@ -51,7 +51,7 @@ def save_snapshot(
 
     Names are never used twice, since viewers keep a mesh by its name.
 
-    :param directory: made when needed; ~ is the home
+    :param folder: that gets the file
     :param interrupted: asked all the while; True: leave no file and raise
     :raises InputError: if there is nothing to save yet
     :raises Gr2tError: if the file cannot be written, or the writing was interrupted
@@ -78,19 +78,8 @@ def save_snapshot(
         go_on()
     expected = sum(
         int(np.count_nonzero(keyframe.rays.converged)) for keyframe in reconstruction.keyframes)
-    file = write_views(
-        new_path(Path(directory).expanduser()), meshes, reconstruction.colouring(),
-        expected_vertices=expected)
+    with folder.new_file(time.strftime('mesh_%Y%m%d_%H%M%S'), '.ply') as path:
+        file = write_views(
+            path, meshes, reconstruction.colouring(), expected_vertices=expected)
     low, high = zip(*ranges) if ranges else ((0.0,), (0.0,))
     return Snapshot(file, (min(low), max(high)))
-
-
-def new_path(directory: Path) -> Path:
-    """Return a name that is not in use: mesh_YEARMONTHDAY_HOURMINUTESECOND.ply."""
-    stem = time.strftime('mesh_%Y%m%d_%H%M%S')
-    path = directory / f'{stem}.ply'
-    number = 1
-    while path.exists():
-        number += 1
-        path = directory / f'{stem}_{number}.ply'
-    return path

@@ -99,6 +99,8 @@ class Diagnostics:
         level, text = DiagnosticStatus.OK, 'the map is up to date'
         if not worker.alive:
             level, text = DiagnosticStatus.ERROR, 'the worker has ended: restart the node'
+        elif worker.saver.problem:
+            level, text = DiagnosticStatus.WARN, worker.saver.problem
         elif load > _BUSY:
             level = DiagnosticStatus.WARN
             text = ('the worker is busy all the time: raise ray_stride or voxel_size, lower '

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -17,7 +18,7 @@ from .worker import Worker
 
 class Services:
     """
-    ~/save_snapshot, ~/reset, ~/pause, ~/timing.
+    ~/save_snapshot, ~/save_map, ~/load_map, ~/reset, ~/pause, ~/timing.
 
     :param node: that offers them
     :param worker: the map
@@ -29,18 +30,23 @@ class Services:
         self._pause = pause
         self._log = node.get_logger()
         self.unanswered = 0
-        node.create_service(
-            Trigger, '~/save_snapshot', self._on_save_snapshot,
-            callback_group=ReentrantCallbackGroup())
+        saver = worker.saver
+        for name, begin in (
+                ('save_snapshot', saver.snapshot), ('save_map', saver.save_map),
+                ('load_map', saver.load_map)):
+            node.create_service(
+                Trigger, f'~/{name}', partial(self._on_slow, name, begin),
+                callback_group=ReentrantCallbackGroup())
         node.create_service(Trigger, '~/reset', self._on_reset)
         node.create_service(SetBool, '~/pause', self._on_pause)
         node.create_service(Trigger, '~/timing', self._on_timing)
         self._answered = node.create_guard_condition(lambda: None)
 
-    async def _on_save_snapshot(
-        self, _: Trigger.Request, response: Trigger.Response
+    async def _on_slow(
+        self, name: str, begin: Callable[[], Future[Any]], _: Trigger.Request,
+        response: Trigger.Response,
     ) -> Trigger.Response:
-        """Answer once the file is written; other callbacks go on meanwhile."""
+        """Answer once the file is written or read; other callbacks go on meanwhile."""
         answer: Any = rclpy.task.Future()
 
         def wake(done: Future[Any]) -> None:
@@ -48,17 +54,16 @@ class Services:
             self._answered.trigger()
 
         self.unanswered += 1
-        self._worker.snapshot().add_done_callback(wake)
+        begin().add_done_callback(wake)
         done: Future[Any] = await answer
         self.unanswered -= 1
         error = done.exception()
         response.success = error is None
+        response.message = str(error or done.result())
         if error:
-            response.message = str(error)
-            self._log.warning(f'no snapshot: {response.message}')
+            self._log.warning(f'{name} failed: {response.message}')
         else:
-            response.message = str(done.result())
-            self._log.info(f'snapshot: {response.message}')
+            self._log.info(f'{name}: {response.message}')
         return response
 
     def _on_reset(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

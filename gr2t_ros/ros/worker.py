@@ -4,26 +4,26 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import Future
 import threading
 import time
 import traceback
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from ..core import poses
 from ..core.frozen import room_for
 from ..core.reconstruction import Reconstruction, Update
 from ..core.release import limit_of, used_by
 from ..core.view import View
-from ..errors import FrameError, Gr2tError
+from ..errors import FrameError, Gr2tError, InputError
 from ..io.parts import new_directory, Parts
-from ..io.snapshots import save_snapshot, Snapshot
 from ..settings import Settings
 from .intake import Intake
+from .saver import Copy, Saver
 from .timings import Timings
+
+Result = TypeVar('Result')
 
 _IDLE_STEP = 0.1  # s of marching before another look at the queue
 _SAME_CLOCK = 3600.0  # s; stamps farther from now are those of a recording
@@ -66,7 +66,7 @@ class Worker:
 
     The services' methods may be called from any thread, and only enqueue.
 
-    intake: where the messages go.
+    intake: where the messages go. saver: what writes the map.
 
     :param settings: parameters
     :param outputs: called from the worker's thread, publish_rate times a second
@@ -90,9 +90,9 @@ class Worker:
         self.busy = 0.0  # s
         self.explanations: dict[str, str] = {}  # of drops by the worker itself
         self._unseen: list[int] = []  # stamps of views that were not published yet
-        self._parts = self._new_parts()
-        self._reconstruction = Reconstruction(settings, self._parts)
-        self._in_map = 0  # views since the last reset
+        self._reconstruction = self._empty()
+        self._number = 1  # of the map
+        self._in_map = 0  # its views
         self.waiting_rays = 0
         self._views: deque[View] = deque()
         self._stamp_ns = 0  # of the newest view in the map
@@ -102,11 +102,7 @@ class Worker:
         self._orders: deque[Callable[[], None]] = deque()
         self._stop = False
         self._thread = threading.Thread(target=self._run, name='worker')
-        # one snapshot after the other: each has a copy of the map in memory
-        self._writer = ThreadPoolExecutor(1, thread_name_prefix='snapshot')
-        self._saved = 0  # views that were in the map at the last periodic snapshot
-        self._save_after = time.monotonic()
-
+        self.saver = Saver(settings, self, self._empty, log, self.timings)
         self._told: set[str] = set()
 
     def start(self) -> None:
@@ -115,15 +111,14 @@ class Worker:
 
     def stop(self) -> None:
         """
-        End after the step at hand, with a snapshot where settings ask for one.
+        End after the step at hand, with a last snapshot or map where settings ask for one.
 
-        A snapshot that is being written is given up, so that it leaves no file.
+        What is being written is given up, so that it leaves no file.
         """
         with self._wake:
             self._stop = True
             self._wake.notify()
         self._thread.join()
-        self._writer.shutdown()
 
     @property
     def views(self) -> int:
@@ -143,7 +138,9 @@ class Worker:
     @property
     def parts(self) -> Parts:
         """Return what left memory."""
-        return self._parts
+        sink = self._reconstruction.sink
+        assert isinstance(sink, Parts)
+        return sink
 
     @property
     def memory(self) -> tuple[int, int]:
@@ -168,6 +165,7 @@ class Worker:
             self._settings = self._reconstruction.settings = settings
             self.intake.update(settings)
             self._outputs.update(settings)
+            self.saver.update(settings)
             self._outputs.change(range(len(self._reconstruction.keyframes)))
             self._publish_at = 0.0
             reach = self._reconstruction.depth_max
@@ -180,13 +178,77 @@ class Worker:
             self._orders.append(order)
             self._wake.notify()
 
-    def snapshot(self) -> Future[Snapshot]:
-        """
-        Save the map as it is after the step at hand, all its rays marched; frames go on meanwhile.
+    @property
+    def stopping(self) -> bool:
+        """Return whether it was told to stop."""
+        return self._stop
 
-        :return: holds a Gr2tError if nothing was saved
+    def copy(self, fields: Sequence[str]) -> Copy:
         """
-        return self._writer.submit(self._save_copy)
+        Return the map as it is after the step at hand; frames go on then.
+
+        :param fields: see Reconstruction.frozen
+        :raises Gr2tError: if it was told to stop
+        """
+        room = room_for(self._reconstruction.density, fields) if self.views else {}
+
+        def freeze() -> Copy:
+            with self.timings.measure('copy of the map'):
+                return self._this(self._reconstruction.frozen(room, fields))
+
+        return self._in_turn(freeze)
+
+    def _this(self, reconstruction: Reconstruction) -> Copy:
+        return Copy(
+            reconstruction, self.intake.world.frame, self._number, str(self.parts))
+
+    def check_frame(self, world_frame: str) -> None:
+        """
+        Refuse a map that is not in the world frame of the images.
+
+        :raises InputError: naming both
+        """
+        ours = self.intake.world.frame
+        if ours and world_frame != ours:
+            raise InputError(
+                f'the map is in the world frame {world_frame!r}, but this node builds in '
+                f'{ours!r}: set world_frame to that of the map, or load another')
+
+    def put(self, reconstruction: Reconstruction, world_frame: str) -> None:
+        """
+        Go on with another map after the step at hand.
+
+        :raises Gr2tError: if it was told to stop, or images came in another world frame meanwhile
+        """
+        def replace() -> None:
+            self.check_frame(world_frame)
+            self._replace(reconstruction)
+            reconstruction.settings = self._settings
+            self.intake.world.frame = world_frame
+            self._stamp_ns = reconstruction.stamp_ns
+            self._in_map = reconstruction.views
+            self.waiting_rays = sum(len(item.rays.pixels) for item in reconstruction.keyframes)
+            self._outputs.change(range(len(reconstruction.keyframes)))
+            self._publish_at = 0.0
+
+        self._in_turn(replace)
+
+    def _in_turn(self, task: Callable[[], Result]) -> Result:
+        """Run a task in the worker's thread after the step at hand; return what it does."""
+        done: Future[Result] = Future()
+
+        def order() -> None:
+            try:
+                done.set_result(task())
+            except Exception as error:  # whatever it is, who waits must get an answer
+                done.set_exception(error)
+
+        with self._wake:
+            if self._stop:
+                raise Gr2tError('the node was told to stop')
+            self._orders.append(order)
+            self._wake.notify()
+        return done.result()
 
     def summary(self) -> str:
         """Return what became of the images, and how long it took, as text."""
@@ -199,8 +261,8 @@ class Worker:
                 f'{camera.integrated} integrated, {dropped.total()} dropped'
                 f'{f" ({reasons})" if reasons else ""}, {camera.waiting} waiting')
         lines[-1] += f', {len(self._reconstruction.keyframes)} keyframes'
-        if self._parts.keyframes:
-            lines.append(str(self._parts))
+        if self.parts.keyframes:
+            lines.append(str(self.parts))
         return '\n'.join([*lines, self.timings.table()])
 
     def _notify(self) -> None:
@@ -213,15 +275,11 @@ class Worker:
             try:
                 step()
                 self._publish()
-                self._save_now_and_then()
+                self.saver.now_and_then(self._number, self._in_map)
             except Exception as error:  # the thread must outlive whatever one step does
                 self._fail('the worker', error)
             self.busy += time.perf_counter() - began
-        if self._settings.snapshot_on_exit:
-            try:
-                self._log.info(f'snapshot: {self._save(self._reconstruction)}')
-            except Exception as error:
-                self._log.error(f'no snapshot: {error}')
+        self.saver.last(self._this(self._reconstruction))
         self._reconstruction.close()
 
     def _next(self) -> Callable[[], None] | None:
@@ -290,10 +348,10 @@ class Worker:
     def _account(self, update: Update) -> None:
         self.waiting_rays = update.waiting
         self._outputs.change((*update.changed, *update.released))
-        if update.released and self._parts.keyframes == len(update.released):
+        if update.released and self.parts.keyframes == len(update.released):
             self._log.warning(
                 'memory is full (max_memory_mb): the keyframes farthest from the camera leave the '
-                f'display; finished, each becomes a PLY file in {self._parts.directory}')
+                f'display; finished, each becomes a PLY file in {self.parts.directory}')
         for notice in update.notices:
             self._log.info(notice)
 
@@ -310,65 +368,21 @@ class Worker:
                     self.timings.add('stamp to publish', latency)
         self._unseen.clear()
 
-    def _save_now_and_then(self) -> None:
-        """Begin a snapshot every snapshot_period, if there is something new."""
-        now = time.monotonic()
-        period = self._settings.snapshot_period
-        if not period or now < self._save_after + period or self._in_map == self._saved:
-            return
-        self._save_after, self._saved = float('inf'), self._in_map
-
-        def report(answer: Future[Snapshot]) -> None:
-            # the next period begins when this one is written: slow disks get fewer, not a queue
-            self._save_after = time.monotonic()
-            if error := answer.exception():
-                self._log.error(f'no periodic snapshot: {error}')
-            else:
-                self._log.info(f'periodic snapshot: {answer.result()}')
-
-        self.snapshot().add_done_callback(report)
-
-    def _save_copy(self) -> Snapshot:
-        """Save a copy of the map, in the writer's thread; the worker stops for the copying."""
-        room = room_for(self._reconstruction.density) if self._reconstruction.keyframes else {}
-        copy: Future[Reconstruction] = Future()
-
-        def order() -> None:
-            try:
-                with self.timings.measure('copy of the map'):
-                    frozen = self._reconstruction.frozen(room)
-                copy.set_result(frozen)
-            except Exception as error:  # whatever it is, who waits must get an answer
-                copy.set_exception(error)
-
-        with self._wake:
-            if self._stop:
-                raise Gr2tError('the node was told to stop')
-            self._orders.append(order)
-            self._wake.notify()
-        return self._save(copy.result(), lambda: self._stop)
-
-    def _save(
-        self, reconstruction: Reconstruction, interrupted: Callable[[], bool] = lambda: False
-    ) -> Snapshot:
-        with self.timings.measure('snapshot'):
-            snapshot = save_snapshot(
-                reconstruction, self._settings.snapshot_directory, interrupted)
-        return replace(snapshot, elsewhere=str(self._parts))
-
-    def _new_parts(self) -> Parts:
-        return Parts(
-            lambda: new_directory(Path(self._settings.snapshot_directory).expanduser()))
-
     def _reset(self) -> None:
         for view in self._views:
             self.intake.drop(view, 'reset')
         self._views.clear()
+        self._replace(self._empty())
+
+    def _empty(self) -> Reconstruction:
+        return Reconstruction(
+            self._settings, Parts(lambda: new_directory(self.saver.folder.made())))
+
+    def _replace(self, reconstruction: Reconstruction) -> None:
         self._reconstruction.close()
-        self._parts = self._new_parts()
-        self._reconstruction = Reconstruction(self._settings, self._parts)
-        self._in_map = self._saved = 0
-        self.waiting_rays = 0
+        self._reconstruction = reconstruction
+        self._in_map = self.waiting_rays = 0
+        self._number += 1
         if self.intake.world.frame:
             self._outputs.clear(self.intake.world.frame)
 

@@ -36,7 +36,7 @@ _PARTS = 'parts'  # folder of what left memory
 _LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'use_mask',
          'reset_on_time_jump', 'queue_size',
          'publish_rate', 'display_stride',
-         'snapshot_directory', 'snapshot_on_exit')
+         'snapshot_directory', 'snapshot_period', 'snapshot_on_exit', 'map_period', 'map_file')
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
