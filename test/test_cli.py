@@ -42,7 +42,7 @@ def test_help_is_quick_and_lists_the_commands() -> None:
             '    assert not {"numba", "cv2", "rosbags", "trimesh"} & set(sys.modules)')
     result = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
     assert result.returncode == 0
-    for command in ('replay', 'info', 'simulate', 'evaluate', 'convert'):
+    for command in ('replay', 'info', 'simulate', 'evaluate', 'view', 'convert'):
         assert f'\n    {command} ' in result.stdout
 
 

@@ -26,6 +26,7 @@ _COMMANDS = {
     'info': 'list what a recording holds and what replay would use',
     'simulate': 'record depth images of a mesh as a sensor would take them',
     'evaluate': 'measure a mesh against a reference',
+    'view': 'make a page of a mesh, to turn it in a browser',
     'convert': 'write a mesh in another format, or with fewer faces',
 }
 

@@ -21,7 +21,7 @@ from .viewpoint import good_view
 Pose = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
-_FOCAL = 1.3  # of the width: a field of view of 42 degrees
+FOCAL = 1.3  # of the width: a field of view of 42 degrees
 _SAMPLES = 2  # a pixel's side
 _KEY = np.array([-0.45, -0.75, -0.55], np.float32)  # light from the upper left, behind the camera
 _FILL = np.array([0.75, -0.1, -0.6], np.float32)
@@ -66,7 +66,7 @@ def preview(
     faces = (np.cumsum(used, dtype=np.int32) - 1)[faces]
     vertices = vertices[used]
     colours = colouring.colours(np.asarray(likelihood)[used], np.asarray(sigma)[used])
-    T_world_camera = good_view(vertices, faces, poses, _FOCAL, height / width)
+    T_world_camera = good_view(vertices, faces, poses, FOCAL, height / width)
     picture = render(vertices, faces, colours, T_world_camera, width, height)
     figure = _framed(picture, colouring, title)
     with whole_file(path) as stream:
@@ -130,7 +130,7 @@ def render(
     points = np.ascontiguousarray((vertices - eye) @ R, np.float32)
     raster = rasterise(
         points, vertex_normals(points, faces), faces, colours,
-        _FOCAL * width * _SAMPLES, width * _SAMPLES, height * _SAMPLES)
+        FOCAL * width * _SAMPLES, width * _SAMPLES, height * _SAMPLES)
     picture = _lit(raster)
     return cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA).astype(np.uint8)
 

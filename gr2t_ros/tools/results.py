@@ -11,7 +11,7 @@ import numpy as np
 
 from ..core.reconstruction import Reconstruction
 from ..core.view_mesh import ViewMesh
-from ..io import ply
+from ..io import ply, trajectory
 from . import report
 from .progress import Progress, say
 from .render import preview
@@ -50,6 +50,10 @@ def write_results(
     if per_view:
         meshes.write_other_views()
         results[str(directory / 'views')] = f'{reconstruction.kept} keyframes'
+    cameras = directory / 'cameras.txt'
+    trajectory.write(cameras, (
+        (item.view.stamp_ns, item.view.T_world_camera) for item in reconstruction.keyframes))
+    results[str(cameras)] = f'poses of {len(reconstruction.keyframes)} keyframes'
     mesh = ply.read(written.path).mesh
     picture = directory / 'preview.png'
     preview(

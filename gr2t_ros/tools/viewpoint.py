@@ -56,6 +56,21 @@ def good_view(
     return T_best
 
 
+def upward(poses: Sequence[Pose]) -> Points:
+    """
+    Return what is up in a world: z, unless the cameras that scanned it agree on another direction.
+
+    :param poses: (4, 4) T_world_camera; may be empty
+    :return: (3,) unit vector
+    """
+    mean_up = np.mean([-pose[:3, 1] for pose in poses], axis=0) if len(poses) else np.zeros(3)
+    length = np.linalg.norm(mean_up)
+    # REP 103 has z up, and a few cameras tell it only roughly
+    if length > _KNOWN_UP and mean_up[2] <= _UPRIGHT * length:
+        return mean_up / length
+    return np.array([0.0, 0.0, 1.0])
+
+
 def _samples(vertices: Points, faces: NDArray[np.integer]) -> tuple[Points, Points]:
     """Return points spread evenly over a surface, (n, 3), and its normals there, (n, 3)."""
     faces = faces[::max(len(faces) // (10 * _SAMPLE), 1)]
@@ -79,16 +94,8 @@ def _candidates(
     points: Points, poses: Sequence[Pose], focal: float, aspect: float
 ) -> Iterator[tuple[Pose, float]]:
     """Yield places and how much nicer each is than others that show as much."""
-    up = np.array([0.0, 0.0, 1.0])
-    forward = np.zeros(3)
-    if len(poses):
-        rotations = np.stack([pose[:3, :3] for pose in poses])
-        mean_up = -rotations[:, :, 1].mean(axis=0)
-        if np.linalg.norm(mean_up) > _KNOWN_UP:
-            mean_up /= np.linalg.norm(mean_up)
-            # REP 103 has z up, and a few cameras tell it only roughly
-            up = up if mean_up[2] > _UPRIGHT else mean_up
-        forward = rotations[:, :, 2].mean(axis=0)
+    up = upward(poses)
+    forward = np.mean([pose[:3, 2] for pose in poses], axis=0) if len(poses) else np.zeros(3)
     east = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     east /= np.linalg.norm(east)
     north = np.cross(up, east)
