@@ -11,7 +11,7 @@ ROS_PACKAGES = (
     'visualization-msgs', 'diagnostic-msgs', 'rmw-fastrtps-cpp',
 )
 
-TEST_PACKAGES = ['hypothesis>=6.100', 'pytest>=8.0', 'pytransform3d>=3.5']
+TEST_PACKAGES = ['hypothesis>=6.100', 'mcap>=1.1', 'pytest>=8.0', 'pytransform3d>=3.5']
 
 setup(
     name=NAME,
@@ -37,13 +37,15 @@ setup(
     },
     # The lower bounds let it run on the numpy 1 that humble and jazzy are built with.
     install_requires=[
+        'backports.zstd>=1.0; python_version < "3.14"',
+        'lz4>=4.0',
         'matplotlib>=3.5',
         'numba>=0.57',
         'numpy>=1.21',
         'opencv-python-headless>=4.5',
         'plyfile>=0.8',
         'PyYAML>=5.4',
-        'rosbags>=0.11',
+        'rosbags>=0.11.9',
         'scipy>=1.8',
         'tqdm>=4.57',
         'trimesh>=4.0',

@@ -3,6 +3,7 @@
 """Any kind of recording gives the same views; the topics to use are found, or asked for."""
 from collections.abc import Sequence
 from pathlib import Path
+import re
 
 import bags_for_tests as bags
 from bags_for_tests import DEPTH, INFO, Message
@@ -247,15 +248,49 @@ def test_what_cannot_be_decoded_is_counted_and_the_rest_used(tmp_path: Path) -> 
         assert bag.damage == f'1 messages on {DEPTH} could not be decoded'
 
 
-def test_a_damaged_recording_is_used_as_far_as_it_reads(tmp_path: Path) -> None:
+def test_damage_that_shows_while_reading_costs_no_other_message(tmp_path: Path) -> None:
     large = np.random.default_rng(0).integers(0, 1000, (240, 320), np.uint16)
-    messages = [bags.image(index, data=large) for index in range(20)]
-    path = bags.write(tmp_path / 'scan', messages, 'rosbag1 bz2')
-    content = bytearray(path.read_bytes())
+    messages = [bags.image(index, data=large) for index in range(100)]
+    path = bags.write(tmp_path / 'scan', messages, 'mcap storage zstd')
+    file = path / 'scan.mcap'
+    content = bytearray(file.read_bytes())
     middle = len(content) // 2
     content[middle:middle + 1000] = bytes(1000)
-    path.write_bytes(content)
+    file.write_bytes(content)
     with Bag([path]) as bag:
-        found = list(bag.messages(bag.topics))
-        assert 0 < len(found) < 20
-        assert f'{path} is damaged: used up to' in bag.damage
+        assert (bag.count, bag.damage) == (100, '')
+        stamps = [log_ns for _, _, log_ns in bag.messages(bag.topics)]
+        # a chunk holds eight
+        assert 92 <= len(stamps) < 100
+        assert stamps == sorted(set(stamps))
+        assert (stamps[0], stamps[-1]) == (messages[0].log_ns, messages[-1].log_ns)
+        assert re.fullmatch(
+            rf'{file} is damaged \(.*\): {len(stamps)} messages of 100 can be read; \d+ of '
+            rf'{len(content)} bytes are damaged or lost: from byte \d+ to \d+, after 4.\d s',
+            bag.damage)
+        assert [log_ns for _, _, log_ns in bag.messages(bag.topics)] == stamps
+
+
+def test_the_folder_of_a_killed_recorder(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / 'scan', bags.scan(4))
+    rest = bags.write(tmp_path / 'rest', [bags.image(4), bags.transform(5.5)], 'mcap bare')
+    (path / 'metadata.yaml').unlink()
+    (path / 'scan.mcap').rename(path / 'scan_0.mcap')
+    rest.rename(path / 'scan_1.mcap')
+    with Bag([path]) as bag:
+        assert bag.topics[DEPTH].count == 5
+        assert f'{path} has no metadata.yaml that can be read' in bag.damage
+    (path / 'other_0.mcap').touch()
+    with pytest.raises(InputError, match='files of several recordings; name those of one'):
+        Bag([path])
+
+
+def test_files_that_metadata_does_not_name_yet_and_names_that_are_gone(tmp_path: Path) -> None:
+    path = bags.write(tmp_path / 'scan', bags.scan(4))
+    rest = bags.write(tmp_path / 'rest', [bags.image(4)], 'mcap bare')
+    rest.rename(path / 'scan_1.mcap')
+    with Bag([path]) as bag:
+        assert (bag.topics[DEPTH].count, bag.damage) == (5, '')
+    (path / 'scan.mcap').unlink()
+    with Bag([path]) as bag:
+        assert (bag.topics[DEPTH].count, bag.damage) == (1, f'{path} lacks scan.mcap')

@@ -21,6 +21,8 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # import name -> (requirement in setup.py, rosdep key), where they differ from the import's name
 KEYS = {
+    'backports': ('backports-zstd', 'python3-rosbags-pip'),  # rosbags needs it too
+    'compression': ('backports-zstd', 'python3-rosbags-pip'),  # the same, from Python 3.14 on
     'cv2': ('opencv-python-headless', 'python3-opencv'),
     'llvmlite': ('numba', 'python3-numba'),
     'plyfile': ('plyfile', 'python3-plyfile-pip'),

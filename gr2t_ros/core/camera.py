@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import atan, sqrt
+from math import atan, degrees, sqrt
 
 import cv2
 from numba import njit
@@ -32,7 +32,8 @@ class Camera:
     :param fx: focal lengths and principal point, pixels
     :param model: one of MODELS, as sensor_msgs/CameraInfo names them
     :param distortion: its coefficients in ROS's (OpenCV's) order; empty: no distortion
-    :raises FrameError: if the focal length is not positive or the distortion unknown
+    :raises FrameError: if the focal length is not positive or far too short for the size, or the
+        distortion is unknown
     """
 
     width: int
@@ -50,6 +51,16 @@ class Camera:
             raise FrameError(
                 'uncalibrated', f'camera_info has focal length {self.fx:g}, {self.fy:g} px: the '
                 'camera is not calibrated; publish a camera_info with a valid K')
+        # the density holds what the corners' pixels cover: it would be endless
+        slope = max(
+            max(abs(c), abs(size - 1 - c)) / f for c, size, f in (
+                (self.cx, self.width, self.fx), (self.cy, self.height, self.fy)))
+        if slope > _MAX_SLOPE:
+            raise FrameError(
+                'uncalibrated', f'camera_info has focal length {self.fx:g}, {self.fy:g} px and '
+                f'principal point {self.cx:g}, {self.cy:g} px for {self.width}x{self.height} '
+                f'pixels: some look more than {degrees(atan(_MAX_SLOPE)):.0f} degrees aside, so '
+                'the camera is not calibrated; publish a camera_info with a valid K')
         if any(self.distortion):
             known = _COEFFICIENTS.get(self.model)
             if known is None:

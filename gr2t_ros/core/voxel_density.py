@@ -230,7 +230,7 @@ class VoxelDensity:
         away = float(np.abs(view.T_world_camera[:3, 3]).max())
         if not away + 4 * self.depth_max < reach:
             raise FrameError(
-                'out_of_range', f'the camera is {away:.0f} m from the origin of the world frame; '
+                'out_of_range', f'the camera is {away:.6g} m from the origin of the world frame; '
                 f'with voxels of {1000 * self.voxel_size:g} mm a map reaches {reach:.0f} m: '
                 'choose a nearer world_frame')
 

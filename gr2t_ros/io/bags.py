@@ -5,73 +5,86 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack
+from heapq import merge
 from pathlib import Path
+import re
 from types import TracebackType
 from typing import Any
 
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import get_typestore, Stores
+import yaml
 
 from ..errors import InputError
+from .bag_files import BagFile, ENDINGS, Raw, ROS1_ENDINGS, Topic
 
-_FILES = ('.bag', '.mcap', '.db3')
-
-
-@dataclass(frozen=True)
-class Topic:
-    """
-    A topic of a recording.
-
-    :param types: message types as ROS 2 writes them; several where publishers disagreed
-    :param count: messages
-    """
-
-    name: str
-    types: tuple[str, ...]
-    count: int
+_KINDS = '.bag, .mcap and .db3'
 
 
 class Bag:
     """
     One recording in one or several files or folders: rosbag1, rosbag2 sqlite3 and MCAP.
 
+    What is damaged or cut off is used as far as it can be read, see `damage`.
+
     :param paths: .bag, .mcap, .db3 files and rosbag2 folders; read as one, in order of log time
-    :raises InputError: if one of them is missing or cannot be read
+    :raises InputError: if one of them is missing, or nothing in it can be read
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
         self.paths = tuple(paths)
-        for path in paths:
-            _check(path)
-        if len({path.suffix == '.bag' for path in paths}) > 1:
+        self._notes: list[str] = []
+        files = [file for path in paths for file in self._files_of(path)]
+        if len({file.name.endswith(ROS1_ENDINGS) for file in files}) > 1:
             raise InputError('ROS 1 bags (.bag) and ROS 2 bags cannot be read as one recording')
-        try:
-            self._reader = self._open()
-        except Exception as error:  # damaged files make the library raise anything
-            raise InputError(
-                f'{self.name} cannot be read ({_reason(error)}): it is damaged, cut off or no '
-                f'bag; where a recorder was killed, {_repair(paths[0])} may help') from error
+        with ExitStack() as stack:
+            self._files = [stack.enter_context(BagFile(file)) for file in files]
+            damage = self.damage
+            if damage and not self.count:
+                raise InputError(f'{self.name} cannot be read: it is no bag, or nothing of it is '
+                                 f'left. {damage}')
+            stack.pop_all()
         self._undecoded: set[tuple[str, int]] = set()  # topic, log time
-        self._cut = ''
-        self.topics = self._list_topics()
 
-    def _open(self) -> AnyReader:
-        # the types are used where a bag does not bring its own: rosbag2 before Iron
-        reader = AnyReader(
-            list(self.paths), default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-        return reader
+    def _files_of(self, path: Path) -> list[Path]:
+        """Return a path's files; refuse what is plainly no bag with a sentence that says so."""
+        if not path.exists():
+            raise InputError(f'{path}: no such file or folder')
+        if path.is_dir():
+            return self._files_in(path)
+        if not path.name.endswith(ENDINGS):
+            raise InputError(
+                f'{path} is not a bag: {_KINDS} files and rosbag2 folders can be read')
+        return [path]
 
-    def _list_topics(self) -> dict[str, Topic]:
-        names = sorted({connection.topic for connection in self._reader.connections})
-        topics = {}
-        for name in names:
-            found = [item for item in self._reader.connections if item.topic == name]
-            types = sorted({item.msgtype for item in found if item.msgcount})
-            topics[name] = Topic(
-                name, tuple(types or [found[0].msgtype]), sum(item.msgcount for item in found))
-        return topics
+    def _files_in(self, folder: Path) -> list[Path]:
+        """Return the files of a rosbag2 folder; the metadata.yaml of a killed recorder lacks."""
+        inside = sorted(
+            (file for file in folder.iterdir() if file.name.endswith(ENDINGS)), key=_in_order)
+        try:
+            metadata = yaml.safe_load((folder / 'metadata.yaml').read_bytes())
+            names = [Path(name).name for name in
+                     metadata['rosbag2_bagfile_information']['relative_file_paths']]
+        except Exception as error:  # damaged text makes the parser raise anything
+            if not inside:
+                raise InputError(f'{folder} is no rosbag2 folder: it has no metadata.yaml and no '
+                                 f'{_KINDS.replace("and", "or")} file') from error
+            if len({_series(file) for file in inside}) > 1:
+                raise InputError(
+                    f'{folder} is no rosbag2 folder: it has no metadata.yaml that can be read, '
+                    'and files of several recordings; name those of one: '
+                    f'{" ".join(map(str, inside))}') from error
+            self._notes.append(f'{folder} has no metadata.yaml that can be read, as where its '
+                               'recorder was killed: its files are read without')
+            return inside
+        missing = [name for name in names if not (folder / name).exists()]
+        if missing:
+            self._notes.append(f'{folder} lacks {", ".join(missing)}')
+        series = {_series(folder / name) for name in names}
+        # a recorder that was killed does not list its last file
+        files = [file for file in inside if file.name in names or _series(file) in series]
+        if not files:
+            raise InputError(f'{folder} holds none of its files: {", ".join(missing)}')
+        return files
 
     @property
     def name(self) -> str:
@@ -79,27 +92,45 @@ class Bag:
         return ' '.join(str(path) for path in self.paths)
 
     @property
+    def topics(self) -> dict[str, Topic]:
+        """Return the topics by name, sorted."""
+        parts = [topic for file in self._files for topic in file.topics]
+        topics = {}
+        for name in sorted({part.name for part in parts}):
+            of_it = [part for part in parts if part.name == name]
+            filled = [part for part in of_it if part.count] or of_it[:1]
+            topics[name] = Topic(
+                name, tuple(sorted({kind for part in filled for kind in part.types})),
+                sum(part.count for part in of_it))
+        return topics
+
+    @property
     def count(self) -> int:
         """Return the number of messages."""
-        return sum(topic.count for topic in self.topics.values())
+        return sum(topic.count for file in self._files for topic in file.topics)
 
     @property
     def begin_ns(self) -> int:
         """Return the first message's log time."""
-        return int(self._reader.start_time) if self.count else 0
+        return min((file.begin_ns for file in self._filled), default=0)
 
     @property
     def end_ns(self) -> int:
         """Return the last message's log time."""
-        return int(self._reader.end_time) - 1 if self.count else 0
+        return max((file.end_ns for file in self._filled), default=0)
+
+    @property
+    def _filled(self) -> list[BagFile]:
+        return [file for file in self._files if any(topic.count for topic in file.topics)]
 
     @property
     def damage(self) -> str:
-        """Return what could not be read so far, as a sentence; empty: nothing."""
-        counts = Counter(topic for topic, _ in self._undecoded)
-        parts = [f'{count} messages on {topic} could not be decoded'
-                 for topic, count in sorted(counts.items())]
-        return '; '.join([self._cut, *parts] if self._cut else parts)
+        """Return what could not be read so far, and where, as a sentence; empty: nothing."""
+        counts = Counter(topic for topic, _ in getattr(self, '_undecoded', ()))
+        return '; '.join([
+            *self._notes, *(part for file in self._files for part in file.damage),
+            *(f'{count} messages on {topic} could not be decoded'
+              for topic, count in sorted(counts.items()))])
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, stop_ns: int | None = None
@@ -107,33 +138,24 @@ class Bag:
         """
         Read messages in the order of their log times, one at a time.
 
-        Where the recording turns out to be damaged the messages end, and `damage` says so.
+        What turns out to be damaged is left out, and `damage` says so.
 
         :param topics: only messages of these are decoded
         :param start_ns: first log time
         :param stop_ns: messages from here on are left out
         :return: topic, message, log time in nanoseconds
         """
-        connections = [item for item in self._reader.connections if item.topic in topics]
-        if not connections:
-            return
-        log_ns = start_ns or self.begin_ns
-        try:
-            for connection, log_ns, data in self._reader.messages(
-                    connections, start=start_ns, stop=stop_ns):
-                try:
-                    message = self._reader.deserialize(data, connection.msgtype)
-                except Exception:
-                    self._undecoded.add((connection.topic, log_ns))
-                    continue
-                yield connection.topic, message, log_ns
-        except Exception as error:
-            seconds = (log_ns - self.begin_ns) * 1e-9
-            self._cut = (f'{self.name} is damaged: used up to {seconds:.1f} s of '
-                         f'{(self.end_ns - self.begin_ns) * 1e-9:.1f} s ({_reason(error)})')
-            # a failure leaves the library's reader of ROS 1 bags unfit for further use
-            self._reader.close()
-            self._reader = self._open()
+        def raw(file: BagFile) -> Iterator[tuple[BagFile, Raw]]:
+            for item in file.messages(topics, start_ns, stop_ns):
+                yield file, item
+
+        for file, item in merge(*map(raw, self._files), key=lambda pair: pair[1].log_ns):
+            try:
+                message = file.decode(item)
+            except Exception:  # damaged bytes make the library raise anything
+                self._undecoded.add((item.topic, item.log_ns))
+                continue
+            yield item.topic, message, item.log_ns
 
     def first(self, topic: str) -> Any:
         """Return a topic's first message that can be decoded, or None."""
@@ -143,7 +165,8 @@ class Bag:
 
     def close(self) -> None:
         """Close the files."""
-        self._reader.close()
+        for file in self._files:
+            file.close()
 
     def __enter__(self) -> Bag:
         return self
@@ -155,28 +178,11 @@ class Bag:
         self.close()
 
 
-def _check(path: Path) -> None:
-    """Refuse what is plainly no bag with a sentence that says so."""
-    if not path.exists():
-        raise InputError(f'{path}: no such file or folder')
-    if path.is_dir():
-        if not (path / 'metadata.yaml').is_file():
-            inside = sorted(item for item in path.iterdir() if item.suffix in _FILES)
-            hint = (f'; name the files inside instead: {" ".join(map(str, inside))}' if inside
-                    else ' and no .bag, .mcap or .db3 file')
-            raise InputError(f'{path} is no rosbag2 folder: it has no metadata.yaml{hint}')
-    elif path.suffix not in _FILES:
-        raise InputError(
-            f'{path} is not a bag: .bag, .mcap and .db3 files and rosbag2 folders can be read')
+def _series(file: Path) -> str:
+    """Return what the names of all files of a recording have in common."""
+    return re.sub(r'(_\d+)?(\.\w+)+$', '', file.name)
 
 
-def _repair(path: Path) -> str:
-    if path.suffix == '.bag':
-        return '`rosbag reindex`'
-    if path.suffix == '.mcap' or any(path.glob('*.mcap')):
-        return '`mcap recover`'
-    return '`ros2 bag reindex`'
-
-
-def _reason(error: Exception) -> str:
-    return (str(error) or type(error).__name__).rstrip('.')
+def _in_order(file: Path) -> tuple[int, str]:
+    number = re.search(r'_(\d+)(\.\w+)+$', file.name)
+    return int(number[1]) if number else 0, file.name

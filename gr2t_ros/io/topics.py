@@ -9,7 +9,8 @@ import difflib
 from typing import Any
 
 from ..errors import InputError
-from .bags import Bag, Topic
+from .bag_files import Topic
+from .bags import Bag
 
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
@@ -196,7 +197,7 @@ class _Frames:
         self.frame = frame
         self.world_frame = world_frame.lstrip('/')
         self.parents: dict[str, str] = {}
-        self.dynamic: dict[str, Any] = {}  # child -> its first transform
+        self.dynamic: dict[str, tuple[float, ...]] = {}  # child -> its first transform
         self.moved: set[str] = set()
         enough_ns = bag.begin_ns + _SETTLED_NS
         for topic, message, log_ns in bag.messages(topics):
@@ -210,8 +211,9 @@ class _Frames:
         if child == parent:
             return
         if not static:
-            first = self.dynamic.setdefault(child, item.transform)
-            if self.parents.get(child, parent) != parent or first != item.transform:
+            pose = _numbers(item.transform)
+            first = self.dynamic.setdefault(child, pose)
+            if self.parents.get(child, parent) != parent or first != pose:
                 self.moved.add(child)
         self.parents[child] = parent
 
@@ -258,6 +260,12 @@ class _Frames:
         return [*names[:8], '...'] if len(names) > 8 else names
 
 
+def _numbers(transform: Any) -> tuple[float, ...]:
+    # messages of two files are of two classes, and never equal
+    place, turn = transform.translation, transform.rotation
+    return (place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w)
+
+
 def is_static(topic: str) -> bool:
     """Return whether a topic of tf messages holds static ones."""
     return topic.rpartition('/')[2] == 'tf_static'
@@ -277,7 +285,7 @@ def _pose_topic(topic: Topic, transforms: tuple[str, ...]) -> PoseTopics:
 def _depth_topic(bag: Bag, topic: Topic) -> DepthTopic:
     first = bag.first(topic.name)
     if first is None:
-        raise InputError(f'no message on {topic.name} can be read. {bag.damage}')
+        raise InputError(f'no message on {topic.name} can be read')
     return DepthTopic(
         name=topic.name, compressed=topic.types == (COMPRESSED_IMAGE,),
         rectified='rect' in _base(topic.name).rpartition('/')[2],

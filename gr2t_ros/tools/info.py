@@ -35,6 +35,8 @@ def run(args: argparse.Namespace) -> int:
             print(f'  {topic.count:8d}  {topic.name:{width}}  {", ".join(topic.types)}')
         print('replay would use')
         _print_choice(bag)
+        if bag.damage:
+            print(f'damage\n  {bag.damage}')
     return DONE
 
 

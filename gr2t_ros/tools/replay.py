@@ -88,10 +88,15 @@ def run(args: argparse.Namespace) -> int:
         if bag.count and args.start >= max(length, 1e-9):
             raise InputError(f'--start {args.start:g} s is after the end of {bag.name}, '
                              f'which lasts {length:g} s')
-        sources = topics.choose(
-            bag, depth=args.depth_topic, camera_info=args.camera_info_topic,
-            pose=args.pose_topic, pose_source=settings.pose_source,
-            world_frame=settings.world_frame)
+        try:
+            sources = topics.choose(
+                bag, depth=args.depth_topic, camera_info=args.camera_info_topic,
+                pose=args.pose_topic, pose_source=settings.pose_source,
+                world_frame=settings.world_frame)
+        except InputError as error:
+            if not bag.damage:
+                raise
+            raise InputError(f'{error}\n{bag.damage}') from error
         settings = settings.updated({
             'pose_source': sources.poses.source, 'use_mask': False,
             'world_frame': settings.world_frame or sources.poses.world_frame})
