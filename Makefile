@@ -3,11 +3,13 @@
 # make test-ros  the tests of what uses ROS: what another DISTRO needs
 # make bench     what a frame costs, beside Open3D; docs/performance.md explains it
 # make paper     the paper's experiment again, beside Open3D; docs/results.md explains it
+# make soak      20 minutes of images into the node: memory, the cost of a frame, leaks
+# make chaos     faults around a running node, and what is lost by them
 # make venv      only what these begin with: the environment they run in
 #
-# Options: DISTRO=jazzy (wheels; default kilted), PYTHON=python3.12, ARGS='-k camera' for pytest or
-# ARGS=--quick for the benchmark, MESH=bunny.ply for the paper, EXTRAS. Where ROS 2 is sourced it is
-# used, and DISTRO has no effect.
+# Options: DISTRO=jazzy (wheels; default kilted), PYTHON=python3.12, ARGS='-k camera' for pytest,
+# ARGS=--quick for the benchmark or '--minutes 2' for the soak, MESH=bunny.ply for the paper,
+# EXTRAS. Where ROS 2 is sourced it is used, and DISTRO has no effect.
 
 PYTHON =
 DISTRO = kilted
@@ -20,7 +22,7 @@ RUN = $(VENV)/bin/python
 OTHER_HINTS = [ -n "$(ROS_DISTRO)" ] || \
     ! $(RUN) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 
-.PHONY: venv demo test test-ros bench paper clean
+.PHONY: venv demo test test-ros bench paper soak chaos clean
 
 venv:
 	@$(or $(PYTHON),python3) scripts/setup_venv.py --venv $(VENV) --distro $(DISTRO) \
@@ -40,6 +42,12 @@ test-ros: venv
 bench paper: EXTRAS = dev,simulation,peers
 bench: venv
 	$(RUN) benchmarks/streaming.py $(ARGS)
+
+soak: venv
+	$(RUN) benchmarks/soak.py $(ARGS)
+
+chaos: venv
+	$(RUN) benchmarks/chaos.py $(ARGS)
 
 paper: venv
 	$(RUN) benchmarks/paper.py $(MESH) $(ARGS)

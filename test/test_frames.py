@@ -302,6 +302,18 @@ class TestPoseFromMessages:
         view, = frames.ready()
         np.testing.assert_allclose(view.T_world_camera, at(0.05) @ T_base_camera, atol=1e-9)
 
+    @pytest.mark.parametrize('source', SOURCES)
+    def test_poses_that_jump_are_noticed(self, source):
+        frames = assembler(pose_source=source)
+        for i in range(8):
+            x = 0.01 * i + (0.5 if i > 3 else 0.0)
+            frames.on_pose(pose_message(source, i * 50 * MS, at(x), 'map', ''))
+            frames.on_depth(depth(i * 50 * MS))
+        assert len(frames.ready()) == 8
+        assert frames.world.explanations['world_jump'].startswith(
+            f'the pose of the camera in the {source} messages jumped by 0.51 m and 0.0 degrees in '
+            'map about')
+
     def test_of_another_frame_without_tf_is_said(self):
         frames = self.filled('odometry', 'base')
         frames.on_depth(depth(50 * MS))

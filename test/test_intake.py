@@ -3,6 +3,7 @@
 """What is said of messages that were left out, and of what they show."""
 from messages_for_tests import camera_info, image, tf, transform
 import numpy as np
+import pytest
 
 from gr2t_ros.ros.intake import Intake
 from gr2t_ros.ros.timings import Timings
@@ -35,6 +36,20 @@ def test_a_full_queue_is_explained_once_and_counted() -> None:
     assert line.endswith('[queue_full: said once, then counted]')
     assert intake.cameras[''].dropped['queue_full'] == 3
     assert 'lower the frame rate' in intake.cameras[''].explanations['queue_full']
+
+
+def test_an_image_that_a_defect_costs_is_counted() -> None:
+    intake = intake_of()
+    camera = intake.cameras['']
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError('a defect')
+
+    camera.assembler.on_depth = broken
+    intake.on_depth(image(DEPTH, '16UC1', 0))
+    with pytest.raises(ZeroDivisionError):
+        intake.take()
+    assert camera.dropped == {'error': 1} and camera.waiting == 0
 
 
 def test_a_jump_of_the_world_is_said_once_and_drops_nothing() -> None:

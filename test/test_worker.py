@@ -87,6 +87,46 @@ def test_one_frame_that_fails_costs_itself_only(
     assert rig.said('the frame of 1700000000.200 s failed: ZeroDivisionError: a defect') == 1
 
 
+def test_what_fails_again_and_again_is_said_while_it_does(
+    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add, wrong = Reconstruction.add, threading.Event()
+
+    def fails(self: Reconstruction, view: View, load: float) -> Update:
+        if wrong.is_set():
+            raise ZeroDivisionError('a defect')
+        return add(self, view, load)
+
+    monkeypatch.setattr(Reconstruction, 'add', fails)
+    rig = make()
+    assert rig.worker.failing == ''
+    wrong.set()
+    rig.feed()
+    rig.wait(lambda: rig.dropped == {'error': COUNT}, 'the frames to fail')
+    assert rig.worker.failing == (
+        'frames fail again and again: ZeroDivisionError: a defect')
+    wrong.clear()
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'the next frames')
+    assert rig.worker.failing == ''
+
+
+def test_what_listeners_do_costs_no_frame(make: Callable[..., Rig]) -> None:
+    """Publishing that fails is logged with its place once, and the frames go on."""
+    rig = make()
+
+    def broken(*_: Any) -> bool:
+        raise OSError('no such publisher')
+
+    rig.outputs.publish = broken
+    rig.feed()
+    rig.wait(lambda: rig.integrated == COUNT, 'all frames')
+    rig.wait(lambda: rig.worker.failing, 'the failure')
+    assert 'publishing fail again and again: OSError: no such publisher' in rig.worker.failing
+    assert rig.said('in broken') == 1
+    assert rig.dropped == {}
+
+
 def test_paused_images_are_counted(make: Callable[..., Rig]) -> None:
     rig = make()
     rig.worker.intake.pause(True)

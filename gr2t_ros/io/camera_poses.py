@@ -9,6 +9,7 @@ from ..core.poses import HISTORY, MAX_DISORDER_NS, NotYet, Pose, PoseBuffer, sec
 from ..errors import FrameError
 from ..settings import Settings
 from . import messages
+from .jumps import JumpWatch
 from .world import World
 
 
@@ -33,6 +34,7 @@ class CameraPoses:
         self._history = HISTORY + settings.max_wait_for_pose
         self._frames = ('', '')  # of the messages: parent, child
         self._poses = PoseBuffer(f'the {self._source} message', self._history)
+        self._watch = JumpWatch()
 
     def on_pose(self, msg: Any) -> None:
         """
@@ -50,7 +52,12 @@ class CameraPoses:
         if (item.parent, item.child) != self._frames:
             self._frames = (item.parent, item.child)
             self._poses = PoseBuffer(self._poses.name, self._history)
+            self._watch = JumpWatch()
         self._poses.add(item.stamp_ns, item.T_parent_child)
+        if jump := self._watch.add(item.stamp_ns, item.T_parent_child):
+            self._world.explain_jump(
+                jump, f'the pose of {item.child or "the camera"} in the {self._source} messages',
+                item.parent, item.stamp_ns)
         if error:
             raise error
 

@@ -67,15 +67,26 @@ class World:
 
     def _look_for_jump(self, item: messages.StampedPose) -> None:
         jump = self._watched[item.child].add(item.stamp_ns, item.T_parent_child)
-        if jump is None:
-            return
-        way = (
-            f'set world_frame to {item.child}, which does not jump' if len(self._watched) > 1
-            else 'take the poses of an odometry that does not jump, where there is one')
+        if jump is not None:
+            self.explain_jump(
+                jump, f'frame {item.child}', item.parent, item.stamp_ns,
+                f'set world_frame to {item.child}, which does not jump'
+                if len(self._watched) > 1 else '')
+
+    def explain_jump(
+        self, jump: tuple[float, float], what: str, parent: str, stamp_ns: int, way_out: str = ''
+    ) -> None:
+        """
+        Say what jumped, once.
+
+        :param jump: of JumpWatch
+        :param way_out: what to do about it; '': take other poses
+        """
+        way_out = way_out or 'take the poses of an odometry that does not jump, where there is one'
         self.explanations.setdefault('world_jump', (
-            f'frame {item.child} jumped by {jump[0]:.2f} m and {np.degrees(jump[1]):.1f} degrees '
-            f'in {item.parent} about {seconds(item.stamp_ns)}, as where SLAM corrects itself: '
-            f'what is in the map stays where it was, and surfaces may stand twice; {way}'))
+            f'{what} jumped by {jump[0]:.2f} m and {np.degrees(jump[1]):.1f} degrees in '
+            f'{parent or "the world"} about {seconds(stamp_ns)}, as where SLAM corrects itself: '
+            f'what is in the map stays where it was, and surfaces may stand twice; {way_out}'))
 
     def transform(self, target: str, source: str, stamp_ns: int, hint: str) -> Pose:
         """

@@ -83,7 +83,9 @@ class Diagnostics:
         load = min(self._rate('busy', worker.busy), 1.0)
         values: dict[str, object] = {
             'views': worker.views, 'keyframes': worker.keyframes, 'blocks': worker.blocks,
-            'waiting rays': worker.waiting_rays, 'worker load (%)': 100 * load}
+            'waiting rays': worker.waiting_rays, 'worker load (%)': 100 * load,
+            'worker on frames (s)': sum(
+                worker.timings.total(stage) for stage in ('integrate', 'march', 'release'))}
         for percent in (50, 95):
             latency = worker.timings.percentile('stamp to publish', percent, _NEWEST)
             if latency is not None:
@@ -99,6 +101,8 @@ class Diagnostics:
         level, text = DiagnosticStatus.OK, 'the map is up to date'
         if not worker.alive:
             level, text = DiagnosticStatus.ERROR, 'the worker has ended: restart the node'
+        elif worker.failing:
+            level, text = DiagnosticStatus.ERROR, f'{worker.failing}; the log says where'
         elif worker.saver.problem:
             level, text = DiagnosticStatus.WARN, worker.saver.problem
         elif load > _BUSY:

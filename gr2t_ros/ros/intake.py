@@ -176,15 +176,24 @@ class Intake:
         return len(self._messages)
 
     def take(self) -> list[View]:
-        """Take the next message, if there is one; return the views that are ready now."""
-        feed = None
+        """
+        Take the next message, if there is one; return the views that are ready now.
+
+        :raises Exception: whatever a defect raises; an image that it costs is counted
+        """
+        feed = camera = None
         with self._lock:
             if self._messages:
                 feed, camera = self._messages.popleft()
                 if camera is not None:
                     camera.queued -= 1
         if feed:
-            feed()
+            try:
+                feed()
+            except Exception:  # the message is lost, and must not be missed
+                if camera is not None:
+                    camera.lost['error'] += 1
+                raise
         if len(self.world.went_back) > self._jumps:
             self._jumps = len(self.world.went_back)
             stamp_ns = self.world.went_back[-1]

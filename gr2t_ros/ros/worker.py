@@ -3,7 +3,7 @@
 """One thread that takes the messages in their order and builds the map from them."""
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future
 import threading
@@ -26,6 +26,7 @@ from .timings import Timings
 Result = TypeVar('Result')
 
 _IDLE_STEP = 0.1  # s of marching before another look at the queue
+_AGAIN = 3  # failures in a row that are no accident
 _SAME_CLOCK = 3600.0  # s; stamps farther from now are those of a recording
 
 
@@ -89,6 +90,8 @@ class Worker:
         self._now_ns = now_ns
         self.busy = 0.0  # s
         self.explanations: dict[str, str] = {}  # of drops by the worker itself
+        self._in_a_row: Counter[str] = Counter()  # failures of one kind after the other
+        self._failure = ''
         self._unseen: list[int] = []  # stamps of views that were not published yet
         self._reconstruction = self._empty()
         self._number = 1  # of the map
@@ -134,6 +137,12 @@ class Worker:
     def blocks(self) -> int:
         """Return the number of the lattice's blocks."""
         return self._reconstruction.blocks
+
+    @property
+    def failing(self) -> str:
+        """Return what fails again and again, as a sentence; '' where nothing does."""
+        kinds = [kind for kind, count in self._in_a_row.items() if count >= _AGAIN]
+        return f'{" and ".join(kinds)} fail again and again: {self._failure}' if kinds else ''
 
     @property
     def parts(self) -> Parts:
@@ -272,12 +281,14 @@ class Worker:
     def _run(self) -> None:
         while (step := self._next()) is not None:
             began = time.perf_counter()
-            try:
-                step()
-                self._publish()
-                self.saver.now_and_then(self._number, self._in_map)
-            except Exception as error:  # the thread must outlive whatever one step does
-                self._fail('the worker', error)
+            for kind, what in (
+                    ('step', step), ('publishing', self._publish),
+                    ('saving', lambda: self.saver.now_and_then(self._number, self._in_map))):
+                try:
+                    what()
+                    self._in_a_row[kind] = 0
+                except Exception as error:  # the thread must outlive whatever one step does
+                    self._fail(kind, f'the worker\'s {kind}', error)
             self.busy += time.perf_counter() - began
         self.saver.last(self._this(self._reconstruction))
         self._reconstruction.close()
@@ -331,8 +342,9 @@ class Worker:
         except Exception as error:  # costs this frame, not the others
             self.intake.drop(view, 'error')
             self.explanations['error'] = 'a frame failed: the log says where'
-            self._fail(f'the frame of {view.stamp_ns * 1e-9:.3f} s', error)
+            self._fail('frames', f'the frame of {poses.seconds(view.stamp_ns)}', error)
             return
+        self._in_a_row['frames'] = 0
         self.intake.cameras[view.camera_name].integrated += 1
         self._in_map += 1
         if self._in_map == 1:
@@ -392,7 +404,9 @@ class Worker:
             self._told.add(reason)
             self._log.warning(f'{sentence} [{reason}: said once, then counted]')
 
-    def _fail(self, what: str, error: Exception) -> None:
+    def _fail(self, kind: str, what: str, error: Exception) -> None:
+        self._in_a_row[kind] += 1
+        self._failure = f'{type(error).__name__}: {error}'
         self._log.error(f'{what} failed: {type(error).__name__}: {error}')
         place = ''.join(traceback.format_tb(error.__traceback__))
         if place not in self._told:
