@@ -205,6 +205,21 @@ class ExactDensity:
         if (pixels, cells) != (self._pixels, self._cells):
             raise ValueError('layout of the views')
 
+    def merge(self, other: ExactDensity) -> None:
+        """Add the views of another density with the same bandwidths, after those that are here."""
+        ours, theirs = self._views, other.state.views
+        layout = theirs.layout[:theirs.size].copy()
+        layout[:, 0] += self._pixels
+        layout[:, 2] += self._cells
+        here = self.used
+        self._views = Views(ours.size + theirs.size, **{
+            name: _appended(
+                getattr(ours, name), here[name],
+                layout if name == 'layout' else getattr(theirs, name)[:count])
+            for name, count in other.used.items()})
+        self._pixels += other.used['depth']
+        self._cells += other.used['near']
+
     def _padding(self, width: int, height: int) -> tuple[int, int, int, int, int]:
         """Return an image's row stride, padding, cells in a row, padded rows, rows of cells."""
         before, reach = ceil(2 * self.window.reach), ceil(self.window.reach)

@@ -169,6 +169,26 @@ def restore(
         raise InputError(f'its content contradicts itself ({error})') from error
 
 
+def differing(
+    ours: Settings, our_voxel: float, theirs: Settings, their_voxel: float
+) -> list[tuple[str, object, object]]:
+    """
+    Return the name and both values of each of FIXED in which two maps differ.
+
+    :param our_voxel: metres, what voxel_size came to; 0: not known yet, as where it is empty
+    """
+    found: list[tuple[str, object, object]] = []
+    for name in FIXED:
+        a, b = getattr(ours, name), getattr(theirs, name)
+        if name == 'voxel_size':
+            a, b = our_voxel, their_voxel
+            if 'exact' in (ours.density, theirs.density) or a == 0:
+                continue
+        if a != b:
+            found.append((name, a, b))
+    return found
+
+
 def _camera(item: Mapping[str, Any]) -> tuple[Camera, str, str]:
     fx, fy, cx, cy = (float(item[name]) for name in ('fx', 'fy', 'cx', 'cy'))
     return Camera(

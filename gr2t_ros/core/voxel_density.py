@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ..errors import FrameError, InputError
 from . import blocks as lattice
 from .block_removal import without
-from .blocks import Blocks, SIDE
+from .blocks import Blocks, SIDE, VOXELS
 from .camera import Camera
 from .compiled import run_all
 from .view import View
@@ -163,6 +163,26 @@ class VoxelDensity:
         self.size, self.pixels, self.aliased_pixels = views, pixels, aliased_pixels
         self._change = change
         self._filter(np.arange(1, blocks.size, dtype=np.int32), pool)
+
+    def merge(self, other: VoxelDensity) -> NDArray[np.int32]:
+        """
+        Add the samples of another lattice with the same voxels, whose change numbers end here.
+
+        :return: the numbers of its blocks in this one, from its block 1 on
+        """
+        size = other.blocks.size
+        self._change = max(self._change, other.change)
+        found = self.cover(other.blocks.key[1:size])
+        for name in ('value', 'expected'):
+            ours = getattr(self.blocks, name).reshape(-1, VOXELS)
+            theirs = getattr(other.blocks, name).reshape(-1, VOXELS)[1:size]
+            for begin in range(0, len(found), _BLOCKS):
+                ours[found[begin:begin + _BLOCKS]] += theirs[begin:begin + _BLOCKS]
+        self._stale.append(found)
+        self.size += other.size
+        self.pixels += other.pixels
+        self.aliased_pixels += other.aliased_pixels
+        return found
 
     def _filter(self, chosen: NDArray[np.int32], pool: Executor | None) -> None:
         """Compute the spline of some blocks."""

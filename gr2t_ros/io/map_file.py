@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.reconstruction import Reconstruction
-from ..core.state import columns_of, FIXED, Kind, restore, state_of
+from ..core.state import columns_of, differing, Kind, restore, state_of
 from ..errors import Gr2tError, InputError
 from ..settings import Settings
 from .files import whole_file
@@ -52,10 +52,14 @@ class SavedMap:
     views: int
     keyframes: int
 
+    @property
+    def content(self) -> str:
+        """Return what the file holds, as text."""
+        return f'{self.views} views, {self.keyframes} keyframes, {self.size / 1e6:.1f} MB'
+
     def __str__(self) -> str:
         """Return the path, ': ' and what the file holds."""
-        return (f'{self.path}: {self.views} views, {self.keyframes} keyframes, '
-                f'{self.size / 1e6:.1f} MB')
+        return f'{self.path}: {self.content}'
 
 
 def save_map(
@@ -176,19 +180,13 @@ class MapFile:
         :raises InputError: naming the settings that differ, or what is wrong with the content
         """
         settings = reconstruction.settings
-        differing = []
-        for name in FIXED:
-            ours, theirs = getattr(settings, name), getattr(self.settings, name)
-            if name == 'voxel_size':
-                if ours == 0 or settings.density == 'exact':
-                    continue
-                theirs = self.voxel_size
-            if ours != theirs:
-                differing.append(f'{name} is {theirs} there and {ours} here')
-        if differing:
+        different = differing(settings, settings.voxel_size, self.settings, self.voxel_size)
+        if different:
             raise InputError(
-                f'cannot go on with the map {self.path}: {", ".join(differing)}; set what the map '
-                'was built with')
+                f'cannot go on with the map {self.path}: '
+                + ', '.join(f'{name} is {there} there and {here} here'
+                            for name, here, there in different)
+                + '; set what the map was built with')
         try:
             restore(reconstruction, self._numbers, self)
         except OSError as error:

@@ -23,6 +23,7 @@ DONE, FAILED, UNUSABLE, INTERRUPTED = 0, 1, 2, 130
 # each is a module beside this one with add_arguments(parser) and run(args)
 _COMMANDS = {
     'replay': 'turn recordings into a likelihood-coloured mesh',
+    'merge': 'sum saved maps of one world, or make the mesh of one',
     'info': 'list what a recording holds and what replay would use',
     'simulate': 'record depth images of a mesh as a sensor would take them',
     'evaluate': 'measure a mesh against a reference',

@@ -32,14 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='one parameter, as in ROS; wins over both; may be repeated')
 
 
-def settings(args: argparse.Namespace) -> Settings:
+def settings(args: argparse.Namespace, base: Settings | None = None) -> Settings:
     """
     Return the parameters that the options give.
 
     :param args: parsed options of add_arguments
+    :param base: what holds where they say nothing; None: the defaults
     :raises InputError: for a file, a name or a value that cannot be used
     """
-    result = Settings()
+    result = base or Settings()
     if args.preset:
         result = _updated(result, _preset(args.preset))
     if args.params:

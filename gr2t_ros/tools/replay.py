@@ -5,9 +5,8 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, ExitStack
 from dataclasses import asdict
-import os
 from pathlib import Path
 import signal
 import textwrap
@@ -15,12 +14,14 @@ from threading import current_thread, Event, main_thread
 from time import perf_counter
 from types import FrameType
 
+from ..core.poses import seconds
 from ..core.reconstruction import Reconstruction, Update, warm_up
 from ..core.view import View
 from ..errors import FrameError, Gr2tError, InputError
 from ..io import topics
 from ..io.bags import Bag
 from ..io.frames import FrameAssembler
+from ..io.map_file import MapFile
 from ..io.parts import emptied, Parts
 from ..io.views import views
 from ..settings import Settings
@@ -28,7 +29,7 @@ from . import options, report
 from .cli import DONE, INTERRUPTED
 from .info import depth_text, poses_text
 from .progress import Progress, say
-from .results import write_results
+from .results import load, MAP_NAME, march_waiting, opened_map, output_folder, write_results
 
 _MAX_WAITING = 100  # images, while the recording has not come to their poses yet
 _PARTS = 'parts'  # folder of what left memory
@@ -59,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--per-view', action='store_true', help='also write DIR/views/view_NNNN.ply, a keyframe '
         'each')
+    parser.add_argument(
+        '--save-map', action='store_true', help=f'also write DIR/{MAP_NAME}: all that the map '
+        'needs to go on')
+    parser.add_argument(
+        '--resume', metavar='MAP', type=Path, help='go on with a saved map, a file or the folder '
+        'of a replay, with its parameters; images up to its newest are passed over')
     options.add_arguments(parser)
 
 
@@ -80,10 +87,10 @@ def run(args: argparse.Namespace) -> int:
     :raises InputError: if the call or the recording cannot be used
     :raises Gr2tError: if a result cannot be written
     """
-    settings = options.settings(args)
-    if args.world_frame:
-        settings = settings.updated({'world_frame': args.world_frame})
-    with Bag(args.bags) as bag:
+    with ExitStack() as stack:
+        resumed = stack.enter_context(opened_map(args.resume)) if args.resume else None
+        settings = _settings(args, resumed)
+        bag = stack.enter_context(Bag(args.bags))
         length = (bag.end_ns - bag.begin_ns) * 1e-9
         if bag.count and args.start >= max(length, 1e-9):
             raise InputError(f'--start {args.start:g} s is after the end of {bag.name}, '
@@ -100,22 +107,24 @@ def run(args: argparse.Namespace) -> int:
         settings = settings.updated({
             'pose_source': sources.poses.source, 'use_mask': False,
             'world_frame': settings.world_frame or sources.poses.world_frame})
-        directory = _output(args.output or _named_after(args.bags[0]))
+        directory = output_folder(args.output or _named_after(args.bags[0]))
         say(f'{bag.name}: {length:.1f} s, {bag.count} messages')
         say(f'  depth        {depth_text(bag, sources.depth)}')
         say(f'  camera_info  {sources.camera_info}')
         say(f'  poses        {poses_text(sources.poses)}')
         say(_parameters(settings))
         say('preparing the kernels (the first run compiles them: about a minute) ...')
-        parts = Parts(lambda: emptied(directory / _PARTS))
-        if (directory / _PARTS).is_dir():
-            emptied(directory / _PARTS)  # of a former run
+        parts = _parts(directory, resumed)
         done = report.Run(settings, startup_seconds=warm_up(settings), parts=parts)
         with closing(Reconstruction(settings, parts)) as reconstruction:
+            if resumed:
+                load(resumed, reconstruction)
+
             def write() -> None:
                 title = ' '.join(path.name for path in bag.paths)
                 print(write_results(
-                    reconstruction, done, directory, title, per_view=args.per_view))
+                    reconstruction, done, directory, title, per_view=args.per_view,
+                    with_map=args.save_map))
             try:
                 interrupted = _Replay(args, bag, sources, reconstruction, done).read()
             except Exception:
@@ -125,6 +134,30 @@ def run(args: argparse.Namespace) -> int:
                 raise
             write()
     return INTERRUPTED if interrupted else DONE
+
+
+def _settings(args: argparse.Namespace, resumed: MapFile | None) -> Settings:
+    settings = options.settings(args, resumed.settings if resumed else None)
+    if args.world_frame:
+        settings = settings.updated({'world_frame': args.world_frame})
+    if resumed is None:
+        return settings
+    if settings.world_frame not in ('', resumed.world_frame):
+        raise InputError(
+            f'cannot go on with the map {resumed.path}: it is in the world frame '
+            f'{resumed.world_frame!r}, not {settings.world_frame!r}')
+    return settings.updated({'world_frame': resumed.world_frame})
+
+
+def _parts(directory: Path, resumed: MapFile | None) -> Parts:
+    """Return where what leaves memory goes; nothing of another map is left there."""
+    folder = directory / _PARTS
+    if resumed and resumed.path.resolve().parent == directory.resolve():
+        folder.mkdir(exist_ok=True)
+        return Parts(lambda: folder)
+    if folder.is_dir():
+        emptied(folder)
+    return Parts(lambda: emptied(folder))
 
 
 class _Replay:
@@ -140,6 +173,8 @@ class _Replay:
         self._reconstruction = reconstruction
         self._done = done
         self._said = False
+        # of the map that it goes on with
+        self._newest_ns = reconstruction.stamp_ns if reconstruction.views else -1
 
     def read(self) -> bool:
         """
@@ -179,7 +214,8 @@ class _Replay:
             raise InputError(self._nothing())
         begin = perf_counter()
         try:
-            self._finish()
+            for update in march_waiting(self._reconstruction):
+                self._count(update)
         except KeyboardInterrupt:
             return True
         finally:
@@ -189,6 +225,10 @@ class _Replay:
     def _add(self, view: View) -> None:
         done = self._done
         try:
+            if view.stamp_ns <= self._newest_ns:
+                raise FrameError(
+                    'in_map', 'not newer than the newest image of the map that it goes on with, '
+                    f'{seconds(self._newest_ns)}')
             update = self._reconstruction.add(view)
         except FrameError as error:
             if error.reason == 'memory':
@@ -205,16 +245,6 @@ class _Replay:
             done.first_stamp_ns = view.stamp_ns
         done.last_stamp_ns = view.stamp_ns
         done.integrated += 1
-
-    def _finish(self) -> None:
-        """March what waits, a second at a time."""
-        update = self._reconstruction.finish(budget=0.0)
-        total = update.waiting
-        with Progress(total, 'rays that wait') as bar:
-            while update.waiting:
-                update = self._reconstruction.finish(budget=1.0)
-                self._count(update)
-                bar.reach(total - update.waiting)
 
     def _count(self, update: Update) -> None:
         self._done.marched += update.marched
@@ -269,18 +299,6 @@ def _interruptible() -> Iterator[Event]:
 def _named_after(bag: Path) -> Path:
     name = bag.resolve().name if bag.is_dir() else bag.stem
     return Path(f'{name}_gr2t')
-
-
-def _output(directory: Path) -> Path:
-    """Return the folder, made and fit to be written to, before hours are spent on its content."""
-    try:
-        directory.mkdir(parents=True, exist_ok=True)
-        if os.access(directory, os.W_OK):
-            return directory
-        reason = 'it is read-only'
-    except OSError as error:
-        reason = error.strerror or str(error)
-    raise InputError(f'cannot write to the folder {directory}: {reason}; name another with -o')
 
 
 def _parameters(settings: Settings) -> str:

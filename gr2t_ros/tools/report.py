@@ -116,12 +116,14 @@ def table(content: Mapping[str, Any], run: Run, results: Mapping[str, str]) -> s
               if reason not in frames['dropped']]
     lines += [
         f'rays     {rays["marched"]} marched, {rays["remarched"]} times again; '
-        f'{100 * rays["converged"] / max(rays["marched"] + rays["remarched"], 1):.1f} % converged',
-        f'time     {run.loop_seconds:.1f} s: {content["frames_per_second"]:.2f} frames/s, '
-        f'{content["realtime_factor"]:.2f} x real time; besides {run.startup_seconds:.1f} s for '
-        f'the kernels and {run.finish_seconds:.1f} s to finish and write',
-        'mean     ' + ', '.join(f'{stage} {timing[stage]["mean"]:.1f} ms' for stage in STAGES),
-        f'memory   {content["peak_memory_mb"]:.0f} MB at most']
+        f'{100 * rays["converged"] / max(rays["marched"] + rays["remarched"], 1):.1f} % converged']
+    if run.loop_seconds:
+        lines += [
+            f'time     {run.loop_seconds:.1f} s: {content["frames_per_second"]:.2f} frames/s, '
+            f'{content["realtime_factor"]:.2f} x real time; besides {run.startup_seconds:.1f} s '
+            f'for the kernels and {run.finish_seconds:.1f} s to finish and write',
+            'mean     ' + ', '.join(f'{stage} {timing[stage]["mean"]:.1f} ms' for stage in STAGES)]
+    lines.append(f'memory   {content["peak_memory_mb"]:.0f} MB at most')
     if content['mesh'].get('vertices') == 0:
         lines.append(
             'note     the mesh is empty: no ray found a maximum of the likelihood; are the '

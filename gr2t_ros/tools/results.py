@@ -1,25 +1,81 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What a replay leaves: mesh.ply, preview.png, report.json and a mesh for each view."""
+"""What a replay leaves: mesh.ply, preview.png, report.json, a mesh for each view, the map."""
 from __future__ import annotations
 
 from collections.abc import Iterator
+import os
 from pathlib import Path
 from time import perf_counter
 
 import numpy as np
 
-from ..core.reconstruction import Reconstruction
+from ..core.reconstruction import Reconstruction, Update
 from ..core.view_mesh import ViewMesh
+from ..errors import InputError
 from ..io import ply, trajectory
+from ..io.map_file import MapFile, save_map
 from . import report
 from .progress import Progress, say
 from .render import preview
 
+MAP_NAME = 'map.gr2t'
+
+
+def output_folder(directory: Path) -> Path:
+    """
+    Return the folder, made and fit to be written to, before hours are spent on its content.
+
+    :raises InputError: if it cannot be made or is read-only
+    """
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        if os.access(directory, os.W_OK):
+            return directory
+        reason = 'it is read-only'
+    except OSError as error:
+        reason = error.strerror or str(error)
+    raise InputError(f'cannot write to the folder {directory}: {reason}; name another with -o')
+
+
+def opened_map(path: Path) -> MapFile:
+    """
+    Open a saved map.
+
+    :param path: the file, or the folder of a replay that wrote one
+    :raises InputError: see MapFile
+    """
+    return MapFile(path / MAP_NAME if path.is_dir() else path)
+
+
+def load(file: MapFile, reconstruction: Reconstruction) -> None:
+    """
+    Load a map, and say what it holds.
+
+    :param reconstruction: empty
+    :raises InputError: see MapFile.load
+    """
+    file.load(reconstruction)
+    count = len(reconstruction.keyframes)
+    say(f'{file.path}: {file.views} views, {count} keyframes, in the frame {file.world_frame}')
+    if gone := count - reconstruction.kept:
+        say(f'{gone} of these keyframes had left memory: their meshes are where that run put them')
+
+
+def march_waiting(reconstruction: Reconstruction) -> Iterator[Update]:
+    """March the rays that wait, a second at a time; yield what was done."""
+    update = reconstruction.finish(budget=0.0)
+    total = update.waiting
+    with Progress(total, 'rays that wait') as bar:
+        while update.waiting:
+            update = reconstruction.finish(budget=1.0)
+            yield update
+            bar.reach(total - update.waiting)
+
 
 def write_results(
     reconstruction: Reconstruction, run: report.Run, directory: Path, title: str, *,
-    per_view: bool,
+    per_view: bool, with_map: bool,
 ) -> str:
     """
     Write all results of a run.
@@ -27,6 +83,7 @@ def write_results(
     :param run: what was counted so far; the times of writing are added
     :param title: below the picture
     :param per_view: whether each keyframe's mesh becomes a file too
+    :param with_map: whether the map becomes one, from which it can go on
     :return: a table of what was written, and of the run
     :raises Gr2tError: if a file cannot be written
     """
@@ -61,6 +118,9 @@ def write_results(
         meshes.colouring, title=title,
         poses=[item.view.T_world_camera for item in reconstruction.keyframes])
     results[str(picture)] = ''
+    if with_map:
+        saved = save_map(directory / MAP_NAME, reconstruction, run.settings.world_frame)
+        results[str(saved.path)] = saved.content
     run.finish_seconds += perf_counter() - begin
     content = report.report(run, counts, mesh.vertex_likelihood)
     report.write(directory / 'report.json', content)
