@@ -19,6 +19,7 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
+from ..core.compiled import cache_notice
 from ..core.reconstruction import warm_up
 from ..errors import InputError
 from .diagnostics import Diagnostics
@@ -80,6 +81,8 @@ class Gr2tNode(Node):
     def _compile(self) -> None:
         """Compile before subscribing: whoever waits for a subscriber finds one that is ready."""
         self.get_logger().info('compiling the kernels, or loading them from the cache')
+        if notice := cache_notice():
+            self.get_logger().warning(notice)
         self.get_logger().info(f'kernels are ready after {warm_up(self.settings):.1f} s')
 
     def _pause(self, paused: bool) -> None:

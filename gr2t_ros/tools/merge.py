@@ -8,13 +8,20 @@ from contextlib import closing
 from pathlib import Path
 
 from ..core.merge import add_map
-from ..core.reconstruction import Reconstruction, warm_up
+from ..core.reconstruction import Reconstruction
 from ..errors import InputError
 from ..io.parts import Parts
 from ..settings import Settings
 from . import options, report
 from .cli import DONE
-from .results import load, march_waiting, opened_map, output_folder, write_results
+from .results import (
+    load,
+    march_waiting,
+    opened_map,
+    output_folder,
+    prepare_kernels,
+    write_results,
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -45,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
             {'world_frame': first.world_frame})
         directory = output_folder(args.output)
         done = report.Run(
-            settings, startup_seconds=warm_up(settings), parts=Parts(lambda: directory))
+            settings, startup_seconds=prepare_kernels(settings), parts=Parts(lambda: directory))
         with closing(Reconstruction(settings)) as reconstruction:
             load(first, reconstruction)
             for path in args.maps[1:]:

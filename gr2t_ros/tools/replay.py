@@ -15,7 +15,7 @@ from time import perf_counter
 from types import FrameType
 
 from ..core.poses import seconds
-from ..core.reconstruction import Reconstruction, Update, warm_up
+from ..core.reconstruction import Reconstruction, Update
 from ..core.view import View
 from ..errors import FrameError, Gr2tError, InputError
 from ..io import topics
@@ -29,7 +29,15 @@ from . import options, report
 from .cli import DONE, INTERRUPTED
 from .info import depth_text, poses_text
 from .progress import Progress, say
-from .results import load, MAP_NAME, march_waiting, opened_map, output_folder, write_results
+from .results import (
+    load,
+    MAP_NAME,
+    march_waiting,
+    opened_map,
+    output_folder,
+    prepare_kernels,
+    write_results,
+)
 
 _MAX_WAITING = 100  # images, while the recording has not come to their poses yet
 _PARTS = 'parts'  # folder of what left memory
@@ -113,9 +121,8 @@ def run(args: argparse.Namespace) -> int:
         say(f'  camera_info  {sources.camera_info}')
         say(f'  poses        {poses_text(sources.poses)}')
         say(_parameters(settings))
-        say('preparing the kernels (the first run compiles them: about a minute) ...')
         parts = _parts(directory, resumed)
-        done = report.Run(settings, startup_seconds=warm_up(settings), parts=parts)
+        done = report.Run(settings, startup_seconds=prepare_kernels(settings), parts=parts)
         with closing(Reconstruction(settings, parts)) as reconstruction:
             if resumed:
                 load(resumed, reconstruction)

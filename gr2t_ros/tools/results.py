@@ -10,16 +10,30 @@ from time import perf_counter
 
 import numpy as np
 
-from ..core.reconstruction import Reconstruction, Update
+from ..core.compiled import cache_notice
+from ..core.reconstruction import Reconstruction, Update, warm_up
 from ..core.view_mesh import ViewMesh
 from ..errors import InputError
 from ..io import ply, trajectory
 from ..io.map_file import MapFile, save_map
+from ..settings import Settings
 from . import report
 from .progress import Progress, say
 from .render import preview
 
 MAP_NAME = 'map.gr2t'
+
+
+def prepare_kernels(settings: Settings) -> float:
+    """
+    Compile the kernels, or load them, and say so.
+
+    :return: seconds it took
+    """
+    say('preparing the kernels (the first run compiles them: about a minute) ...')
+    if notice := cache_notice():
+        say(notice)
+    return warm_up(settings)
 
 
 def output_folder(directory: Path) -> Path:
