@@ -64,7 +64,7 @@ class Truth:
         self.caster = RayCaster(mesh)
         samples, _ = sample_surface(mesh, _SAMPLES, seed=0)
         seen = sum(
-            self._sees(view.camera, view.T_world_camera, samples).astype(int) for view in views)
+            self.sees(view.camera, view.T_world_camera, samples).astype(int) for view in views)
         self.samples = samples[seen >= 2]
 
     def depth(self, view: View) -> Doubles:
@@ -99,12 +99,19 @@ class Truth:
         largest = np.where(np.isnan(steps), np.inf, steps).max(axis=0)
         return largest, np.abs(depths[-1] - depths[0])
 
-    def _sees(self, camera: Camera, T_world_camera: Pose, points: Doubles) -> NDArray[np.bool_]:
-        """Tell which points a camera sees."""
+    def sees(
+        self, camera: Camera, T_world_camera: Pose, points: Doubles, steepest: float = np.pi
+    ) -> NDArray[np.bool_]:
+        """
+        Tell which points of the surface a camera sees.
+
+        :param points: (n, 3) float64
+        :param steepest: angle between a ray and the surface's normal, radians
+        """
         R, eye = T_world_camera[:3, :3], T_world_camera[:3, 3]
         x, y, z = ((points - eye) @ R).T
         u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
         inside = (z > 0) & (abs(u - camera.width / 2) < camera.width / 2) & (
             abs(v - camera.height / 2) < camera.height / 2)
-        hit, _ = self.caster.cast(T_world_camera, np.column_stack([x / z, y / z])[:, None])
-        return inside & (np.abs(hit[:, 0] - z) < _SEEN)
+        hit, angle = self.caster.cast(T_world_camera, np.column_stack([x / z, y / z])[:, None])
+        return inside & (np.abs(hit[:, 0] - z) < _SEEN) & (angle[:, 0] <= steepest)

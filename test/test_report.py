@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from gr2t_ros.core.next_views import NextView
 from gr2t_ros.errors import Gr2tError
 from gr2t_ros.io.parts import Parts
 from gr2t_ros.settings import Settings
@@ -29,10 +31,11 @@ def run() -> report.Run:
 
 
 def test_the_keys_are_those_of_the_documentation(run: report.Run) -> None:
-    content = report.report(run, {'vertices': 3, 'faces': 1}, np.arange(101.0))
+    content = report.report(run, {'vertices': 3, 'edges': 2, 'faces': 1}, np.arange(101.0))
     assert set(content) == {
         'frames', 'rays', 'timing_ms', 'frames_per_second', 'realtime_factor', 'peak_memory_mb',
-        'mesh', 'parts', 'likelihood', 'startup_s', 'finish_s', 'input_damage', 'settings'}
+        'mesh', 'parts', 'likelihood', 'next_views', 'startup_s', 'finish_s', 'input_damage',
+        'settings'}
     assert content['frames'] == {
         'read': 12, 'integrated': 10, 'keyframes': 2, 'dropped': {'no_pose': 2}}
     assert content['rays'] == {'marched': 100, 'remarched': 50, 'converged': 140}
@@ -53,8 +56,25 @@ def test_rates_and_percentiles(run: report.Run) -> None:
     assert 10 < content['peak_memory_mb'] < 1e6
 
 
+def test_views_to_scan_next_are_named(run: report.Run) -> None:
+    """In the report all of them with their orientation, in the table the best three."""
+    T_world_camera = np.array([[0, 0, 1, -1.0], [-1, 0, 0, 0.5], [0, -1, 0, 0.25], [0, 0, 0, 1]])
+    run.next_views = 4 * (NextView(np.array([0.1, 0.2, 0.3]), 0.0121, T_world_camera),)
+    content = report.report(run, {'vertices': 3}, [])
+    found = json.loads(json.dumps(content))['next_views']
+    assert len(found) == 4
+    assert (found[0]['position'], found[0]['area_m2']) == ([0.1, 0.2, 0.3], 0.0121)
+    assert found[0]['viewpoint']['position'] == [-1.0, 0.5, 0.25]
+    turn = Rotation.from_quat(found[0]['viewpoint']['orientation'])
+    np.testing.assert_allclose(turn.as_matrix(), T_world_camera[:3, :3], atol=1e-9)
+    lines = report.table(content, run, {}).splitlines()
+    assert [line for line in lines if line.startswith('next ')] == 3 * [
+        'next     about 0.012 m² missing or doubtful at (0.10, 0.20, 0.30): look from '
+        '(-1.00, 0.50, 0.25)']
+
+
 def test_it_is_written_as_json_or_not_at_all(run: report.Run, tmp_path: Path) -> None:
-    content = report.report(run, {'vertices': 0, 'faces': 0}, [])
+    content = report.report(run, {'vertices': 0, 'edges': 0, 'faces': 0}, [])
     report.write(tmp_path / 'report.json', content)
     assert json.loads((tmp_path / 'report.json').read_text()) == json.loads(json.dumps(content))
     with pytest.raises(Gr2tError, match=r'cannot write .*report\.json/no'):

@@ -10,9 +10,10 @@ import time
 from ..core.colour import Colouring
 from ..core.view_mesh import ViewMesh
 from ..errors import Gr2tError
-from .ply import write_view
+from .ply import write_views
 
 _NAME = 'view_{:06d}.ply'
+_ALL = 1 << 62  # faces: a part is never decimated
 
 
 class Parts:
@@ -41,7 +42,8 @@ class Parts:
             except OSError as error:
                 raise Gr2tError(
                     f'cannot make the folder {error.filename}: {error.strerror}') from error
-        written = write_view(self.directory / _NAME.format(number), number, mesh, colouring)
+        written = write_views(
+            self.directory / _NAME.format(number), lambda _: [(number, mesh)], colouring, _ALL)
         self.keyframes += 1
         self.vertices += written.vertices
         self.edges += written.edges

@@ -13,12 +13,15 @@ import sys
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
+from ..core.next_views import NextView
 from ..io.files import whole_file
 from ..io.parts import Parts
 from ..settings import Settings
 
+_NEXT = 3  # views that the table names
 STAGES = ('read', 'integrate', 'march', 'mesh', 'total')
 
 
@@ -31,6 +34,7 @@ class Run:
     :param seconds: of each of STAGES, once per frame in which the stage ran
     :param loop_seconds: wall time from the first read to the last frame done
     :param first_stamp_ns: of the images that were integrated; likewise last_stamp_ns
+    :param next_views: where to scan next, the best first
     """
 
     settings: Settings
@@ -51,13 +55,14 @@ class Run:
     first_stamp_ns: int = 0
     last_stamp_ns: int = 0
     input_damage: str = ''
+    next_views: tuple[NextView, ...] = ()
 
 
 def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[str, Any]:
     """
     Return the content of report.json.
 
-    :param counts: vertices and faces of the mesh that was written; parts that left memory
+    :param counts: vertices, edges and faces of the mesh that was written; parts that left memory
         before have their own
     :param likelihood: (n,) of its vertices
     """
@@ -81,6 +86,7 @@ def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[s
             'max': float(likelihood.max()) if some else 0.0,
             'p50': float(np.percentile(likelihood, 50)) if some else 0.0,
             'p98': float(np.percentile(likelihood, 98)) if some else 0.0},
+        'next_views': [_next_view(view) for view in run.next_views],
         'startup_s': run.startup_seconds,
         'finish_s': run.finish_seconds,
         'input_damage': run.input_damage,
@@ -128,9 +134,31 @@ def table(content: Mapping[str, Any], run: Run, results: Mapping[str, str]) -> s
         lines.append(
             'note     the mesh is empty: no ray found a maximum of the likelihood; are the '
             'poses those of the images, and is depth_bandwidth not far below the noise?')
+    lines += [_next_line(view) for view in run.next_views[:_NEXT]]
     if run.input_damage:
         lines.append(f'damage   {run.input_damage}')
     return '\n'.join(lines)
+
+
+def _next_view(view: NextView) -> dict[str, Any]:
+    """Return a suggested view as JSON has it: the quaternion is x y z w, the frame optical."""
+    T = view.T_world_camera
+    return {
+        'position': _rounded(view.position), 'area_m2': round(view.area, 6),
+        'viewpoint': {
+            'position': _rounded(T[:3, 3]),
+            'orientation': _rounded(Rotation.from_matrix(T[:3, :3]).as_quat())}}
+
+
+def _next_line(view: NextView) -> str:
+    def text(place: NDArray[np.float64]) -> str:
+        return '(' + ', '.join(f'{value:.2f}' for value in place) + ')'
+    return (f'next     about {view.area:.2g} m² missing or doubtful at {text(view.position)}: '
+            f'look from {text(view.T_world_camera[:3, 3])}')
+
+
+def _rounded(values: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 4) for value in values]
 
 
 def peak_memory_mb() -> float:
