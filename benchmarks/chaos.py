@@ -37,7 +37,7 @@ from std_srvs.srv import SetBool, Trigger
 from synthetic_camera import render, SyntheticCamera
 
 from gr2t_ros.errors import InputError
-from gr2t_ros.io import ply
+from gr2t_ros.io import formats
 from gr2t_ros.ros.isolation import isolated
 
 _PROJECT = Path(__file__).resolve().parents[1]
@@ -237,9 +237,9 @@ class Rig:
 
 def _whole(path: Path) -> bool:
     try:
-        ply.read(path)
-    except InputError:
-        return False
+        formats.read(path)
+    except InputError as error:
+        return 'no triangles' in str(error)  # of an empty mesh
     return True
 
 

@@ -38,7 +38,7 @@ from synthetic_camera import render, SyntheticCamera
 from visualization_msgs.msg import MarkerArray
 
 from gr2t_ros.errors import InputError
-from gr2t_ros.io import ply
+from gr2t_ros.io import formats
 from gr2t_ros.ros.isolation import isolated
 from gr2t_ros.ros.publishers import outputs_profile
 
@@ -162,13 +162,13 @@ class Soak:
     def _count_parts(self) -> None:
         for path in self._folder.glob('snapshots/parts_*/view_*.ply'):
             try:
-                mesh = ply.read(path)
+                mesh = formats.read(path)
             except InputError as error:
                 print(f'a damaged part: {error}')
                 continue
             self.parts += 1
             self.parts_bytes += path.stat().st_size
-            self.vertices += len(mesh.mesh.vertices)
+            self.vertices += len(mesh.vertices)
             path.unlink()
 
     def column(self, name: str) -> NDArray[np.float64]:

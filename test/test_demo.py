@@ -14,7 +14,7 @@ pytest.importorskip('embreex', reason='the ray caster embreex is not installed')
 
 from ros_for_tests import Isolation, LIMIT, wait_until
 
-from gr2t_ros.io.ply import read
+from gr2t_ros.io.formats import read
 from gr2t_ros.ros.isolation import isolated
 from gr2t_ros.tools import demo
 
@@ -32,7 +32,7 @@ def test_it_leaves_a_mesh_and_a_picture(
     finally:
         for number, handler in zip((signal.SIGINT, signal.SIGTERM), handlers):
             signal.signal(number, handler)
-    assert len(read(tmp_path / 'results' / 'mesh.ply').mesh.faces) > 1000
+    assert len(read(tmp_path / 'results' / 'mesh.ply').faces) > 1000
     assert cv2.imread(str(tmp_path / 'results' / 'preview.png')) is not None
     output = capfd.readouterr().out
     assert 'distance to the true surface: mean' in output

@@ -121,7 +121,7 @@ def test_the_command_prints_what_the_file_s_likelihoods_tell(tmp_path, capsys):
         faces=ball.faces.astype(np.int32), edges=ball.edges_unique.astype(np.int32),
         edge_likelihood=np.ones(len(ball.edges_unique), np.float32))
     colouring = Colouring('likelihood', 1.0, 'turbo')
-    ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], colouring)
+    ply.write_view(tmp_path / 'mesh.ply', 0, mesh, colouring)
     ball.export(tmp_path / 'truth.stl')
     likelihood = load_mesh(tmp_path / 'mesh.ply').vertex_attributes['likelihood']
     assert len(likelihood) == len(ball.vertices)

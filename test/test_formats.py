@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_ply import COLOURING, grid
 import trimesh
 
 from gr2t_ros.errors import Gr2tError, InputError
-from gr2t_ros.io import formats, ply
+from gr2t_ros.io import formats
 
 
 def surface() -> formats.Mesh:
@@ -54,8 +53,8 @@ def test_what_is_written_is_read_back(ending: str, tmp_path: Path) -> None:
     assert off.max() <= (6 if ending == '.glb' else 0)
     if ending == '.obj':
         return
-    assert set(found.attributes) == set(formats.ATTRIBUTES)
-    for name in formats.ATTRIBUTES:
+    assert set(found.attributes) == set(mesh.attributes)
+    for name in mesh.attributes:
         np.testing.assert_array_equal(
             found.attributes[name], mesh.attributes[name], name)
 
@@ -81,7 +80,7 @@ def test_a_glb_is_as_the_standard_has_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(place['min'], (low[0], low[2], -high[1]), rtol=1e-6)
     np.testing.assert_allclose(place['max'], (high[0], high[2], -low[1]), rtol=1e-6)
     assert set(primitive['attributes']) == {
-        'POSITION', 'COLOR_0', *(f'_{name.upper()}' for name in formats.ATTRIBUTES)}
+        'POSITION', 'COLOR_0', *(f'_{name.upper()}' for name in mesh.attributes)}
     material = found['materials'][primitive['material']]
     assert material['doubleSided']
     assert material['pbrMetallicRoughness']['metallicFactor'] == 0
@@ -103,16 +102,6 @@ def test_open3d_reads_a_glb(tmp_path: Path) -> None:
     assert found.has_vertex_colors()
 
 
-def test_a_mesh_of_views_is_read_too(tmp_path: Path) -> None:
-    mesh = grid()
-    ply.write_views(tmp_path / 'mesh.ply', lambda stride: [(0, mesh)], COLOURING)
-    found = formats.read(tmp_path / 'mesh.ply')
-    np.testing.assert_array_equal(found.faces, mesh.faces)
-    assert set(found.attributes) == {'likelihood', 'sigma', 'confidence'}
-    np.testing.assert_array_equal(
-        found.attributes['likelihood'], mesh.vertex_likelihood)
-
-
 def test_fewer_faces_keep_the_shape_and_what_it_carries() -> None:
     pytest.importorskip('fast_simplification')
     mesh = surface()
@@ -120,7 +109,7 @@ def test_fewer_faces_keep_the_shape_and_what_it_carries() -> None:
     found = formats.decimated(mesh, 400)
     assert len(found.faces) <= 400
     assert abs(solid(found).volume / solid(mesh).volume - 1) < 0.05
-    assert set(found.attributes) == set(formats.ATTRIBUTES)
+    assert set(found.attributes) == set(mesh.attributes)
     np.testing.assert_allclose(
         found.attributes['likelihood'], found.vertices[:, 0], atol=0.01)
     assert found.colours.shape == (len(found.vertices), 3)
@@ -137,8 +126,11 @@ def test_what_cannot_be_used_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r'must end in \.ply, \.glb, \.obj or \.stl'):
         formats.write(tmp_path / 'mesh.xyz', surface())
     (tmp_path / 'text.ply').write_text('no mesh')
+    formats.write(tmp_path / 'whole.ply', surface())
+    (tmp_path / 'half.ply').write_bytes((tmp_path / 'whole.ply').read_bytes()[:-100])
     trimesh.PointCloud(np.zeros((3, 3))).export(tmp_path / 'points.ply')
     for name, sentence in (('none.glb', 'there is no mesh'), ('text.ply', 'cannot be read as a'),
+                           ('half.ply', 'cannot be read as a'),
                            ('points.ply', 'no triangles|cannot be read')):
         with pytest.raises(InputError, match=sentence):
             formats.read(tmp_path / name)

@@ -2,7 +2,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """One mesh of many views: where the surface is, closed, and incremental is batch."""
 from contextlib import closing
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scenes_for_tests import bumpy_views, looking_at_origin, plane_view, pose, sphere_view
@@ -156,3 +158,141 @@ def test_an_empty_map_has_an_empty_mesh():
         reconstruction.add(View(
             np.full_like(view.depth, np.nan), view.camera, view.T_world_camera, 0))
         assert len(reconstruction.fused_mesh().vertices) == 0
+
+
+def wall(camera, T_world_camera, boxes):
+    """Return a view of boxes (low, high), metres, world."""
+    rays = np.concatenate([camera.rays, np.ones_like(camera.rays[..., :1])], axis=-1)
+    directions, origin = rays @ T_world_camera[:3, :3].T, T_world_camera[:3, 3]
+    depth = np.full(directions.shape[:2], np.inf)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        for low, high in boxes:
+            slabs = np.stack([(np.array(end) - origin) / directions for end in (low, high)])
+            enter, leave = slabs.min(axis=0).max(axis=-1), slabs.max(axis=0).min(axis=-1)
+            depth = np.where((enter <= leave) & (enter > 0), np.minimum(depth, enter), depth)
+    depth[~np.isfinite(depth)] = np.nan
+    return View(depth.astype(np.float32), camera, T_world_camera, 0)
+
+
+def noisy(views, sigma):
+    rng = np.random.default_rng(1)
+    return [View((view.depth + rng.normal(0, sigma, view.depth.shape)).astype(np.float32),
+                 view.camera, view.T_world_camera, n) for n, view in enumerate(views)]
+
+
+def test_planes_of_many_noisy_views_are_one_layer():
+    views = noisy([
+        plane_view(CAMERA, pose([0.05 * n, 0.03 * n, 0], [0, 0, 0]), [0, 0, 1], 0.5)
+        for n in range(-3, 4)], 0.003)
+    mesh = fused(views)
+    assert abs(mesh.vertices[:, 2] - 0.5).mean() < 0.001
+    facing = -normals(mesh)[:, 2]  # the camera is at smaller z
+    assert (facing > 0).all() and edge_counts(mesh).max() == 2
+    # one layer has the area of what it covers
+    covered = np.unique(np.floor(mesh.vertices[mesh.faces].mean(axis=1)[:, :2] / VOXEL), axis=0)
+    assert 0.5 * facing.sum() < 1.02 * len(covered) * VOXEL ** 2
+
+
+def test_a_corner_stays_a_corner():
+    box = ([-0.1, -0.1, -0.1], [0.1, 0.1, 0.1])
+    views = [wall(CAMERA, looking_at_origin([x, y, z], 0.6), [box])
+             for x in (-1, 1) for y in (-1, 1) for z in (-0.8, 0.8)]
+    mesh = fused(views)
+    outside = np.maximum(np.abs(mesh.vertices) - 0.1, 0)
+    inside = np.abs(np.abs(mesh.vertices).max(axis=1) - 0.1)
+    off = np.where(outside.any(axis=1), np.linalg.norm(outside, axis=1), inside)
+    assert np.mean(off) < 0.001 and off.max() < 1.5 * VOXEL
+    assert (edge_counts(mesh) <= 2).all()
+
+
+def test_a_thin_wall_seen_from_both_sides_keeps_them():
+    box = ([-0.15, -0.15, -0.02], [0.15, 0.15, 0.02])  # 8 voxels, 10 h3
+    views = [wall(CAMERA, looking_at_origin([x, 0.1, z], 0.6), [box])
+             for x in (-0.3, 0.3) for z in (-1, 1)]
+    mesh = fused(views)
+    flat = (np.abs(mesh.vertices[:, :2]) < 0.12).all(axis=1)
+    assert np.mean(mesh.vertices[flat, 2] > 0) == pytest.approx(0.5, abs=0.05)
+    assert abs(np.abs(mesh.vertices[flat, 2]) - 0.02).max() < 0.4 * VOXEL
+    sides = normals(mesh)[flat[mesh.faces].all(axis=1), 2]
+    centres = mesh.vertices[mesh.faces][flat[mesh.faces].all(axis=1)].mean(axis=1)[:, 2]
+    assert (sides * centres > 0).all()
+
+
+@pytest.mark.parametrize('gap', [0.03, 0.06, 0.3])
+def test_no_face_bridges_free_space(gap):
+    """A board before a wall: between them is nothing, although cameras see both side by side."""
+    boxes = [([-0.1, -0.1, 0.0], [0.1, 0.1, 0.02]), ([-1, -1, 0.02 + gap], [1, 1, 0.1 + gap])]
+    views = noisy([
+        wall(CAMERA, looking_at_origin([x, 0.1 + 0.2 * x, -1], 0.6), boxes)
+        for x in (-0.4, -0.2, 0.0, 0.2, 0.4)], 0.001)
+    mesh = fused(views)
+    corners = mesh.vertices[mesh.faces][..., 2]
+    assert np.mean(corners < 0.01) > 0.03 and np.mean(corners > 0.01 + gap) > 0.5
+    assert np.ptp(corners, axis=1).max() < 0.5 * gap + VOXEL
+    # the board's rim may bend back by no more than the band in which depths count
+    between = (corners > 0.02 + 0.012) & (corners < 0.02 + gap - 0.012)
+    assert not between.any()
+
+
+def test_edges_have_two_faces_at_most_however_wild_the_surface():
+    rng = np.random.default_rng(3)
+    views = []
+    for n in range(6):
+        view = sphere_views(6)[n]
+        rough = cv2.GaussianBlur(rng.normal(0, 1, view.depth.shape), (0, 0), 1.5)
+        views.append(View((view.depth + 0.03 * rough).astype(np.float32), CAMERA,
+                          view.T_world_camera, n))
+    mesh = fused(views)
+    assert len(mesh.faces) > 1000 and edge_counts(mesh).max() == 2
+
+
+def test_far_from_the_origin_nothing_is_rounded():
+    here = sphere_views(6)
+    away = np.array([2.0 ** 13, -2.0 ** 12, 2.0 ** 10]) * 8 * VOXEL
+    there = []
+    for view in here:
+        T = view.T_world_camera.copy()
+        T[:3, 3] += away
+        there.append(View(view.depth, view.camera, T, 0))
+    near, far = in_order(fused(here)), fused(there)
+    moved = in_order(replace(far, vertices=far.vertices - away))
+    assert len(near.vertices) == len(moved.vertices)
+    assert abs(near.vertices - moved.vertices).max() < 1e-6 * VOXEL
+
+
+def test_another_threshold_makes_the_map_anew():
+    with closing(built(sphere_views(6))) as reconstruction:
+        before = reconstruction.fused_mesh()
+        reconstruction.settings = SETTINGS.updated({'min_confidence': 0.7})
+        assert reconstruction.fuse()
+        fewer = in_order(reconstruction.fused_mesh(1))
+        assert 0 < len(fewer.faces) < len(before.faces)
+    with closing(built(sphere_views(6), reconstruction.settings)) as again:
+        assert_same(fewer, in_order(again.fused_mesh(1)))
+
+
+def test_what_leaves_memory_leaves_the_fused_map():
+    near, far = (plane_view(CAMERA, pose([0, 0, 0], [x, 0, 0]), [0, 0, 1], 0.5) for x in (0, 2))
+    with closing(built([near, far])) as reconstruction:
+        both = reconstruction.fused_mesh()
+        size = reconstruction.fused.nbytes
+        left = reconstruction.keyframes.pop(0)
+        changed = reconstruction.fuse()
+        mesh = reconstruction.fused_mesh()
+        assert 0 < len(mesh.faces) < len(both.faces) and mesh.vertices[:, 0].min() > 1.5
+        assert changed and all(
+            len(reconstruction.fused_region(key).faces) == 0 for key in changed)
+        assert reconstruction.fused.nbytes < 0.7 * size
+        reconstruction.keyframes.insert(0, left)
+        reconstruction.fuse()
+        assert_same(in_order(reconstruction.fused_mesh()), in_order(both))
+
+
+def test_small_islands_are_left_out():
+    box = ([-0.1, -0.1, 0.4], [0.05, 0.1, 0.5])
+    speck = ([0.08, 0.0, 0.4], [0.1, 0.02, 0.5])
+    views = [wall(CAMERA, pose([0, 0, 0], [x, 0, 0]), [box, speck]) for x in (-0.02, 0, 0.02)]
+    with closing(built(views)) as reconstruction:
+        all_of_it, large = reconstruction.fused_mesh(1), reconstruction.fused_mesh(200)
+    assert all_of_it.vertices[:, 0].max() > 0.08 > 0.06 > large.vertices[:, 0].max()
+    assert len(large.faces) > 0.8 * len(all_of_it.faces)

@@ -11,6 +11,7 @@ import bags_for_tests as bags
 import numpy as np
 import pytest
 from scenes_for_tests import bumpy_views, plane_view, pose
+from scipy.spatial import cKDTree
 from test_map_file import assert_same_state, built, kitchen
 
 from gr2t_ros.core.blocks import VOXELS
@@ -20,7 +21,7 @@ from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.view import View
 from gr2t_ros.core.voxel_density import VoxelDensity
 from gr2t_ros.errors import InputError
-from gr2t_ros.io import ply
+from gr2t_ros.io import formats
 from gr2t_ros.io.map_file import MapFile
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools import cli
@@ -175,9 +176,11 @@ def test_maps_of_two_replays(replay: Callable[..., Path], tmp_path: Path) -> Non
     assert cli.main(['merge', str(first), str(second / 'map.gr2t'), '-o', str(out)]) == 0
     whole = replay('whole')
     assert MapFile(out / 'map.gr2t').views == MapFile(whole / 'map.gr2t').views == 8
-    ours, theirs = (ply.read(item / 'mesh.ply').mesh for item in (out, whole))
-    np.testing.assert_array_equal(ours.faces, theirs.faces)
-    np.testing.assert_allclose(ours.vertices, theirs.vertices, atol=1e-6)
+    ours, theirs = (formats.read(item / 'mesh.ply') for item in (out, whole))
+    # but for the order in which the sums were rounded, which may decide whether a face stays
+    assert len(ours.faces) == pytest.approx(len(theirs.faces), rel=0.001)
+    apart, _ = cKDTree(theirs.vertices).query(ours.vertices)
+    assert np.quantile(apart, 0.99) < 2e-6
     again = tmp_path / 'again'
     assert cli.main(['merge', str(out), '-o', str(again), '--per-view']) == 0
     assert (again / 'mesh.ply').read_bytes() == (out / 'mesh.ply').read_bytes()

@@ -9,8 +9,8 @@ import pytest
 from gr2t_ros.core.colour import Colouring
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.errors import Gr2tError
+from gr2t_ros.io.formats import read
 from gr2t_ros.io.parts import emptied, new_directory, Parts
-from gr2t_ros.io.ply import read
 
 COLOURING = Colouring('likelihood', 1.0, 'turbo')
 
@@ -29,7 +29,7 @@ def test_each_keyframe_is_a_whole_file(tmp_path: Path) -> None:
         parts(number, triangle(), COLOURING)
     files = sorted(parts.directory.iterdir())
     assert [path.name for path in files] == ['view_000007.ply', 'view_000012.ply']
-    assert [set(read(path).vertex_view) for path in files] == [{7}, {12}]
+    assert [set(read(path).attributes['view']) for path in files] == [{7}, {12}]
     assert str(parts) == (
         f'2 keyframes that left memory are in {parts.directory}: 6 vertices, 2 edges, 2 faces')
 

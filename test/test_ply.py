@@ -1,26 +1,29 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """A snapshot is read whole by this package and by other programs, or is not there at all."""
-from collections.abc import Iterable
-from dataclasses import replace
+import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from plyfile import PlyData
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
 import pytest
 
 from gr2t_ros.core.colour import Colouring, colours
+from gr2t_ros.core.fused_mesh import SurfaceMesh
 from gr2t_ros.core.view_mesh import ViewMesh
-from gr2t_ros.errors import Gr2tError, InputError
-from gr2t_ros.io import ply
+from gr2t_ros.errors import Gr2tError
+from gr2t_ros.io import formats, ply
 
 COLOURING = Colouring('likelihood', 2.0, 'turbo')
+COLOUR = ('red', 'green', 'blue')
 
 
-def grid(size: int = 9, stride: int = 1, z: float = 1.0) -> ViewMesh:
+def grid(size: int = 9) -> ViewMesh:
     """Return a plane of size x size vertices whose likelihoods differ everywhere."""
-    v, u = np.mgrid[0:size:stride, 0:size:stride]
-    vertices = np.stack([0.1 * u, 0.1 * v, np.full(u.shape, z)], axis=-1).reshape(-1, 3)
+    v, u = np.mgrid[0:size, 0:size]
+    vertices = np.stack([0.1 * u, 0.1 * v, np.ones(u.shape)], axis=-1).reshape(-1, 3)
     i = np.arange(u.size).reshape(u.shape)
     a, b, c, d = (part.ravel() for part in (i[:-1, :-1], i[:-1, 1:], i[1:, :-1], i[1:, 1:]))
     faces = np.concatenate([np.stack([a, c, d], axis=-1), np.stack([a, d, b], axis=-1)])
@@ -38,82 +41,96 @@ def grid(size: int = 9, stride: int = 1, z: float = 1.0) -> ViewMesh:
         edge_likelihood=np.linspace(3, 4, len(edges), dtype=np.float32))
 
 
-def two_views(stride: int) -> Iterable[tuple[int, ViewMesh]]:
-    """Return two views' meshes, numbered 4 and 7."""
-    return [(4, grid(stride=stride, z=1.0)), (7, grid(stride=stride, z=2.0))]
+def fused() -> SurfaceMesh:
+    """Return the same plane as if several views had seen it."""
+    mesh = grid()
+    return SurfaceMesh(
+        mesh.vertices, mesh.vertex_likelihood, mesh.vertex_sigma, mesh.vertex_confidence,
+        np.arange(len(mesh.vertices), dtype=np.int32), mesh.faces)
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
-    """Return a file with two_views, in a folder that had to be made."""
-    return ply.write_views(tmp_path / 'new' / 'mesh.ply', two_views, COLOURING).path
+    """Return the file of a keyframe's mesh, in a folder that had to be made."""
+    return ply.write_view(tmp_path / 'new' / 'mesh.ply', 7, grid(), COLOURING).path
 
 
-def test_what_is_written_is_read_back(file: Path) -> None:
-    found = ply.read(file)
-    one, two = grid(z=1.0), grid(z=2.0)
-    mesh = found.mesh
-    np.testing.assert_allclose(
-        mesh.vertices, np.concatenate([one.vertices, two.vertices]), rtol=1e-6)
-    np.testing.assert_array_equal(mesh.faces[:len(one.faces)], one.faces)
-    np.testing.assert_array_equal(mesh.faces[len(one.faces):], two.faces + len(one.vertices))
-    np.testing.assert_array_equal(mesh.edges[len(one.edges):], two.edges + len(one.vertices))
-    np.testing.assert_array_equal(mesh.edge_likelihood, np.tile(one.edge_likelihood, 2))
-    for name in ('vertex_likelihood', 'vertex_sigma', 'vertex_confidence'):
-        np.testing.assert_array_equal(getattr(mesh, name), np.tile(getattr(one, name), 2))
-    np.testing.assert_array_equal(np.unique(found.vertex_view), [4, 7])
+def columns(element: PlyElement, *names: str) -> NDArray[Any]:
+    """Return an element's properties side by side."""
+    return np.stack([element[name] for name in names], axis=-1)
+
+
+def test_a_keyframe_s_mesh_is_read_back(file: Path) -> None:
+    mesh, found = grid(), formats.read(file)
+    np.testing.assert_allclose(found.vertices, mesh.vertices, rtol=1e-6)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    for name in ('likelihood', 'sigma', 'confidence'):
+        np.testing.assert_array_equal(found.attributes[name], getattr(mesh, f'vertex_{name}'))
+    assert set(found.attributes['view']) == {7}
     np.testing.assert_array_equal(
-        found.vertex_colours, colours(mesh.vertex_likelihood, 2.0, 'turbo'))
+        found.colours, colours(mesh.vertex_likelihood, 2.0, 'turbo'))
+    edges = PlyData.read(str(file))['gr2t_edge']
+    np.testing.assert_array_equal(columns(edges, 'vertex1', 'vertex2'), mesh.edges)
+    np.testing.assert_array_equal(edges['likelihood'], mesh.edge_likelihood)
+    np.testing.assert_array_equal(
+        columns(edges, *COLOUR), colours(mesh.edge_likelihood, 2.0, 'turbo'))
+
+
+def test_a_fused_mesh_is_read_back(tmp_path: Path) -> None:
+    mesh = fused()
+    written = ply.write_fused(tmp_path / 'mesh.ply', mesh, COLOURING)
+    assert (written.vertices, written.faces, written.edges) == (81, 128, 0)
+    found = formats.read(written.path)
+    np.testing.assert_allclose(found.vertices, mesh.vertices, rtol=1e-6)
+    np.testing.assert_array_equal(found.faces, mesh.faces)
+    assert set(found.attributes) == {'likelihood', 'sigma', 'confidence', 'views'}
+    for name, values in found.attributes.items():
+        np.testing.assert_array_equal(values, getattr(mesh, f'vertex_{name}'))
+    np.testing.assert_array_equal(
+        found.colours, colours(mesh.vertex_likelihood, 2.0, 'turbo'))
 
 
 def test_colours_may_show_the_deviation(tmp_path: Path) -> None:
     """An edge has the colour of its vertices' mean; likelihoods stay what they are."""
-    colouring = Colouring('sigma', 4e-4, 'jet')
-    path = ply.write_views(tmp_path / 'mesh.ply', two_views, colouring).path
-    found = ply.read(path)
-    sigma = found.mesh.vertex_sigma
-    np.testing.assert_array_equal(found.vertex_colours, colours(4e-4 - sigma, 4e-4, 'jet'))
-    np.testing.assert_array_equal(found.mesh.edge_likelihood, ply.read(
-        ply.write_views(tmp_path / 'other.ply', two_views, COLOURING).path).mesh.edge_likelihood)
+    mesh = grid()
+    path = ply.write_view(tmp_path / 'mesh.ply', 0, mesh, Colouring('sigma', 4e-4, 'jet')).path
+    sigma = mesh.vertex_sigma
+    np.testing.assert_array_equal(
+        formats.read(path).colours, colours(4e-4 - sigma, 4e-4, 'jet'))
     edges = PlyData.read(str(path))['gr2t_edge']
+    np.testing.assert_array_equal(edges['likelihood'], mesh.edge_likelihood)
     np.testing.assert_array_equal(
-        np.stack([edges[name] for name in ('red', 'green', 'blue')], axis=-1),
-        colours(4e-4 - sigma[found.mesh.edges].mean(axis=1), 4e-4, 'jet'))
+        columns(edges, *COLOUR), colours(4e-4 - sigma[mesh.edges].mean(axis=1), 4e-4, 'jet'))
 
 
-def test_the_header_is_that_of_the_design(file: Path) -> None:
-    header = file.read_bytes().split(b'end_header')[0].decode().splitlines()
-    assert header[1] == 'format binary_little_endian 1.0'
+def header(file: Path) -> list[str]:
+    """Return the lines of a header, without comments."""
+    lines = file.read_bytes().split(b'end_header')[0].decode().splitlines()
+    assert lines[:2] == ['ply', 'format binary_little_endian 1.0']
+    return [line for line in lines[2:] if not line.startswith('comment')]
+
+
+def test_the_headers_are_those_of_the_design(file: Path, tmp_path: Path) -> None:
     colour = ['property uchar red', 'property uchar green', 'property uchar blue']
-    assert [line for line in header if not line.startswith('comment')][2:] == [
-        'element vertex 162', 'property float x', 'property float y', 'property float z',
-        *colour, 'property float likelihood', 'property float sigma', 'property float confidence',
-        'property int view',
-        'element face 256', 'property list uchar int vertex_indices',
-        'element gr2t_edge 416', 'property int vertex1', 'property int vertex2',
+    vertex = [
+        'element vertex 81', 'property float x', 'property float y', 'property float z',
+        *colour, 'property float likelihood', 'property float sigma', 'property float confidence']
+    face = ['element face 128', 'property list uchar int vertex_indices']
+    assert header(file) == [
+        *vertex, 'property int view', *face,
+        'element gr2t_edge 208', 'property int vertex1', 'property int vertex2',
         *colour, 'property float likelihood']
-
-
-def test_trimesh_reads_it_and_keeps_the_likelihood(file: Path) -> None:
-    trimesh = pytest.importorskip('trimesh')
-    mesh = trimesh.load(file, process=False)
-    assert mesh.faces.shape == (256, 3)
-    assert mesh.area == pytest.approx(2 * 0.8 ** 2, rel=1e-5)
-    likelihood = mesh.metadata['_ply_raw']['vertex']['data']['likelihood']
-    np.testing.assert_array_equal(
-        np.ravel(likelihood), np.tile(grid().vertex_likelihood, 2))
-    np.testing.assert_array_equal(
-        mesh.visual.vertex_colors[:, :3], ply.read(file).vertex_colours)
+    path = ply.write_fused(tmp_path / 'mesh.ply', fused(), COLOURING).path
+    assert header(path) == [*vertex, 'property int views', *face]
 
 
 def test_open3d_reads_it(file: Path) -> None:
     open3d = pytest.importorskip('open3d', exc_type=ImportError)
     mesh = open3d.io.read_triangle_mesh(str(file))
-    assert len(mesh.triangles) == 256
+    assert len(mesh.triangles) == 128
+    np.testing.assert_allclose(np.asarray(mesh.vertices), grid().vertices, rtol=1e-6)
     np.testing.assert_allclose(
-        np.asarray(mesh.vertices), ply.read(file).mesh.vertices, rtol=1e-6)
-    np.testing.assert_allclose(
-        255 * np.asarray(mesh.vertex_colors), ply.read(file).vertex_colours, atol=0.51)
+        255 * np.asarray(mesh.vertex_colors), formats.read(file).colours, atol=0.51)
 
 
 def test_meshlab_reads_it(file: Path) -> None:
@@ -121,43 +138,19 @@ def test_meshlab_reads_it(file: Path) -> None:
     meshes = pymeshlab.MeshSet()
     meshes.load_new_mesh(str(file))
     mesh = meshes.current_mesh()
-    assert mesh.face_number() == 256
-    assert mesh.vertex_number() == 162
+    assert mesh.face_number() == 128
+    assert mesh.vertex_number() == 81
     np.testing.assert_allclose(
-        255 * mesh.vertex_color_matrix()[:, :3], ply.read(file).vertex_colours, atol=0.51)
-
-
-def test_too_many_faces_are_decimated_and_it_is_said(tmp_path: Path) -> None:
-    written = ply.write_views(tmp_path / 'mesh.ply', two_views, COLOURING, max_faces=70)
-    assert written.stride == 2
-    assert (written.vertices, written.edges, written.faces) == (50, 112, 64)
-    assert len(ply.read(written.path).mesh.faces) == 64
-
-
-def test_hopeless_strides_are_not_tried(tmp_path: Path) -> None:
-    tried = []
-
-    def meshes(stride: int) -> Iterable[tuple[int, ViewMesh]]:
-        tried.append(stride)
-        return two_views(stride)
-    ply.write_views(tmp_path / 'mesh.ply', meshes, COLOURING, 20, expected_vertices=162)
-    assert tried == [4]
+        255 * mesh.vertex_color_matrix()[:, :3], formats.read(file).colours, atol=0.51)
 
 
 def test_a_mesh_without_anything_is_a_file_too(tmp_path: Path) -> None:
-    written = ply.write_views(
-        tmp_path / 'mesh.ply', lambda stride: [], replace(COLOURING, scale=0.0))
-    assert written.vertices == 0
-    assert ply.read(written.path).mesh.faces.shape == (0, 3)
-
-
-def test_a_view_of_which_nothing_is_left_may_be_among_them(tmp_path: Path) -> None:
     none = ViewMesh(
         np.zeros((0, 3)), *np.zeros((3, 0), np.float32), np.zeros((0, 3), np.int32),
         np.zeros((0, 2), np.int32), np.zeros(0, np.float32))
-    written = ply.write_views(
-        tmp_path / 'mesh.ply', lambda stride: [(0, none), (1, grid()), (2, none)], COLOURING)
-    assert set(ply.read(written.path).vertex_view) == {1}
+    written = ply.write_view(tmp_path / 'mesh.ply', 0, none, COLOURING)
+    assert (written.vertices, written.faces, written.edges) == (0, 0, 0)
+    assert [element.count for element in PlyData.read(str(written.path))] == [0, 0, 0]
 
 
 def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path) -> None:
@@ -166,21 +159,23 @@ def test_a_full_disk_is_said_and_nothing_is_left(tmp_path: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (3000, limits[1]))  # no file may be larger
     try:
         with pytest.raises(Gr2tError, match=r'cannot write .*mesh\.ply: File too large'):
-            ply.write_views(tmp_path / 'mesh.ply', two_views, COLOURING)
+            ply.write_fused(tmp_path / 'mesh.ply', fused(), COLOURING)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failure_leaves_the_older_file_whole(file: Path) -> None:
+def test_a_failure_leaves_the_older_file_whole(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     before = file.read_bytes()
 
-    def breaks(stride: int) -> Iterable[tuple[int, ViewMesh]]:
-        yield 0, grid()
+    def breaks(_: int) -> None:
         raise OSError(28, 'No space left on device')
 
+    monkeypatch.setattr(os, 'fsync', breaks)
     with pytest.raises(Gr2tError, match=r'mesh\.ply: No space left on device'):
-        ply.write_views(file, breaks, COLOURING)
+        ply.write_fused(file, fused(), COLOURING)
     assert file.read_bytes() == before
     assert list(file.parent.iterdir()) == [file]
 
@@ -190,15 +185,5 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path: Path, name: str) -> N
     (tmp_path / 'mesh.ply').mkdir()
     (tmp_path / 'inside').write_text('a file where a folder is needed')
     with pytest.raises(Gr2tError, match=f'cannot write .*{name}'):
-        ply.write_views(tmp_path / name, two_views, COLOURING)
+        ply.write_fused(tmp_path / name, fused(), COLOURING)
     assert sorted(item.name for item in tmp_path.iterdir()) == ['inside', 'mesh.ply']
-
-
-def test_other_files_are_refused_with_a_sentence(tmp_path: Path, file: Path) -> None:
-    with pytest.raises(InputError, match=r'cannot read .*none\.ply: No such file'):
-        ply.read(tmp_path / 'none.ply')
-    other = tmp_path / 'other.ply'
-    for content in (b'', b'nothing', b'\xff\xfe\x00', file.read_bytes()[:-100]):
-        other.write_bytes(content)
-        with pytest.raises(InputError, match=r'other\.ply is not a PLY file with likelihoods'):
-            ply.read(other)

@@ -139,7 +139,11 @@ def test_block_runs(block: list[str], folder: Path) -> None:
             assert words[0] == 'python'
             benchmark(words[1:])
         if '-o' in words and words[1] == 'replay':
-            for name in re.findall(r'^\| `(out/\S+)`', README, re.M):
+            rows = [line for line in README.splitlines() if line.startswith('| `out/')]
+            for name in re.findall(
+                    r'`(out/[\w.]+)`', ''.join(row for row in rows if 'with `--' not in row)):
+                if name == 'out/parts':  # of what does not fit into memory
+                    continue
                 assert (folder / name).stat().st_size > 0
 
 

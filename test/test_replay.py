@@ -2,7 +2,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A recording becomes a mesh, a picture and a report, whatever happens on the way."""
 from collections.abc import Callable
-from functools import partial
 import json
 import os
 from pathlib import Path
@@ -17,7 +16,7 @@ import pytest
 
 from gr2t_ros.core.reconstruction import Reconstruction, Update
 from gr2t_ros.core.view import View
-from gr2t_ros.io import ply
+from gr2t_ros.io import formats, trajectory
 from gr2t_ros.tools import cli
 
 FEW = ('-p', 'keyframe_translation:=0.03', '-p', 'threads:=1')
@@ -39,16 +38,15 @@ def test_a_scan_becomes_mesh_picture_and_report(
     monkeypatch.chdir(tmp_path)
     assert replay(bags.write(tmp_path / 'scan', bags.scan(6)), '--per-view') == 0
     out = tmp_path / 'scan_gr2t'  # where no folder is named
-    mesh = ply.read(out / 'mesh.ply')
+    mesh = formats.read(out / 'mesh.ply')
     # a wall with 2 mm of noise, a metre away; the camera moves 2 cm a frame
-    assert np.abs(mesh.mesh.vertices[:, 2] - 1).mean() < 0.001
-    assert len(mesh.mesh.faces) > 2500
-    assert sorted(set(mesh.vertex_view)) == [0, 1, 2]
+    assert np.abs(mesh.vertices[:, 2] - 1).mean() < 0.001
+    assert len(mesh.faces) > 1000
+    assert mesh.attributes['views'].max() == 3
     found = report(out)
     assert found['frames'] == {'read': 6, 'integrated': 6, 'keyframes': 3, 'dropped': {}}
-    assert found['mesh'] == {'vertices': len(mesh.mesh.vertices),
-                             'edges': len(mesh.mesh.edges), 'faces': len(mesh.mesh.faces)}
-    assert found['likelihood']['max'] == mesh.mesh.vertex_likelihood.max()
+    assert found['mesh'] == {'vertices': len(mesh.vertices), 'faces': len(mesh.faces)}
+    assert found['likelihood']['max'] == mesh.attributes['likelihood'].max()
     assert found['rays']['marched'] == 3 * bags.WIDTH * bags.HEIGHT
     assert found['settings']['world_frame'] == 'map'
     assert found['input_damage'] == ''
@@ -58,26 +56,18 @@ def test_a_scan_becomes_mesh_picture_and_report(
     assert found['next_views']
     views = sorted((out / 'views').iterdir())
     assert [path.name for path in views] == ['view_0000.ply', 'view_0001.ply', 'view_0002.ply']
-    parts = [ply.read(path).mesh.vertices for path in views]
-    np.testing.assert_array_equal(np.concatenate(parts), mesh.mesh.vertices)
+    for number, path in enumerate(views):
+        part = formats.read(path)
+        assert set(part.attributes['view']) == {number}
+        assert np.abs(part.vertices[:, 2] - 1).mean() < 0.001
+    stamps, _ = trajectory.read(out / 'cameras.txt')
+    assert stamps == [bags.stamp(i) for i in (0, 2, 4)]
     assert cv2.imread(str(out / 'preview.png')).std() > 10
     printed = capsys.readouterr()
     for name in ('mesh.ply', 'preview.png', 'report.json', 'views'):
         assert f'scan_gr2t/{name}' in printed.out
     assert f'{DEPTH} (6 images; rectified' in printed.err
     assert 'keyframe_translation:=0.03' in printed.err
-
-
-def test_a_mesh_of_too_many_faces_is_decimated_and_its_views_are_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(ply, 'write_views', partial(ply.write_views, max_faces=2000))
-    path = bags.write(tmp_path / 'scan', bags.scan(6))
-    assert replay(path, '-o', tmp_path / 'out', '--per-view') == 0
-    assert 'decimated by 2 in rows and columns' in capsys.readouterr().out
-    assert report(tmp_path / 'out')['mesh']['faces'] < 2000
-    views = sorted((tmp_path / 'out' / 'views').iterdir())
-    assert [len(ply.read(view).mesh.faces) > 1000 for view in views] == [True] * 3
 
 
 def test_bad_frames_are_counted_and_the_rest_still_reconstruct(
@@ -102,7 +92,7 @@ def test_bad_frames_are_counted_and_the_rest_still_reconstruct(
         'no_valid_depth': 1, 'encoding': 1, 'image_size': 1, 'depth_unit': 1}.items()
     out = capsys.readouterr().out
     assert "dropped  1 encoding: depth image has encoding '8UC1'" in out
-    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 500
+    assert len(formats.read(tmp_path / 'out' / 'mesh.ply').faces) > 500
 
 
 def test_start_and_max_frames_choose_a_part(tmp_path: Path) -> None:
@@ -110,7 +100,7 @@ def test_start_and_max_frames_choose_a_part(tmp_path: Path) -> None:
     assert replay(path, '-o', tmp_path / 'out', '--start', 0.3, '--max-frames', 2) == 0
     assert report(tmp_path / 'out')['frames']['integrated'] == 2
     # the camera's way begins where it was at the fourth image
-    mesh = ply.read(tmp_path / 'out' / 'mesh.ply').mesh
+    mesh = formats.read(tmp_path / 'out' / 'mesh.ply')
     assert mesh.vertices[:, 0].min() > 0.02 * 3 - 0.55
 
 
@@ -144,7 +134,7 @@ def test_an_interrupt_saves_what_is_done(
     assert signal.getsignal(signal.SIGINT) is before
     frames = report(tmp_path / 'out')['frames']
     assert (frames['read'], frames['integrated']) == (4, 4)
-    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 500
+    assert len(formats.read(tmp_path / 'out' / 'mesh.ply').faces) > 500
     assert 'stopping after this frame' in capsys.readouterr().err
 
 
@@ -198,7 +188,7 @@ def test_the_kitchen_needs_no_option_but_patience(data: Path, tmp_path: Path) ->
     assert found['frames']['integrated'] == 4
     assert found['frames']['dropped'] == {}
     assert found['settings']['world_frame'] == 'map'
-    vertices = ply.read(tmp_path / 'out' / 'mesh.ply').mesh.vertices
+    vertices = formats.read(tmp_path / 'out' / 'mesh.ply').vertices
     assert len(vertices) > 1000
     assert np.all(np.ptp(vertices, axis=0) < 10)  # a room
 
@@ -216,17 +206,16 @@ def test_what_does_not_fit_into_memory_is_on_the_disk(
     parts = sorted((out / 'parts').iterdir())
     left = found['parts']['keyframes']
     assert 0 < left == len(parts) < found['frames']['keyframes']
-    meshes = [ply.read(path) for path in parts]
-    rest = ply.read(out / 'mesh.ply')
-    assert sum(len(mesh.mesh.faces) for mesh in meshes) == found['parts']['faces'] > 0
-    views = [set(mesh.vertex_view) for mesh in [*meshes, rest]]
-    assert sorted(number for some in views for number in some) == list(
-        range(found['frames']['keyframes']))
+    meshes = [formats.read(path) for path in parts]
+    rest = formats.read(out / 'mesh.ply')
+    assert sum(len(mesh.faces) for mesh in meshes) == found['parts']['faces'] > 0
+    views = {int(number) for mesh in meshes for number in set(mesh.attributes['view'])}
+    kept = [int(path.stem[-4:]) for path in (out / 'views').iterdir()]
+    assert sorted([*views, *kept]) == list(range(found['frames']['keyframes']))
     for mesh in [*meshes, rest]:
-        assert np.abs(mesh.mesh.vertices[:, 2] - 1).mean() < 0.002
-    assert len(list((out / 'views').iterdir())) == found['frames']['keyframes'] - left
+        assert np.abs(mesh.vertices[:, 2] - 1).mean() < 0.002
     assert f'go to {out / "parts"}, a PLY file each' in printed.err
-    assert f'the {len(views[-1])} keyframes still in memory' in printed.out
+    assert f'of the {len(kept)} keyframes still in memory' in printed.out
     assert f'the other {left} keyframes, finished, a file each' in printed.out
     assert replay(bag, '-o', out) == 0
     assert list((out / 'parts').iterdir()) == []
@@ -238,4 +227,4 @@ def test_a_bound_that_no_map_fits_into_ends_it(
     bag = bags.write(tmp_path / 'scan', bags.scan(6))
     assert replay(bag, '-o', tmp_path / 'out', '-p', 'max_memory_mb:=1') == 1
     assert 'max_memory_mb allows 1: raise it' in capsys.readouterr().err
-    assert len(ply.read(tmp_path / 'out' / 'mesh.ply').mesh.faces) > 0, 'what was done is kept'
+    assert len(formats.read(tmp_path / 'out' / 'mesh.ply').faces) > 0, 'what was done is kept'

@@ -31,7 +31,7 @@ def run() -> report.Run:
 
 
 def test_the_keys_are_those_of_the_documentation(run: report.Run) -> None:
-    content = report.report(run, {'vertices': 3, 'edges': 2, 'faces': 1}, np.arange(101.0))
+    content = report.report(run, {'vertices': 3, 'faces': 1}, np.arange(101.0))
     assert set(content) == {
         'frames', 'rays', 'timing_ms', 'frames_per_second', 'realtime_factor', 'peak_memory_mb',
         'mesh', 'parts', 'likelihood', 'next_views', 'startup_s', 'finish_s', 'input_damage',
@@ -74,7 +74,7 @@ def test_views_to_scan_next_are_named(run: report.Run) -> None:
 
 
 def test_it_is_written_as_json_or_not_at_all(run: report.Run, tmp_path: Path) -> None:
-    content = report.report(run, {'vertices': 0, 'edges': 0, 'faces': 0}, [])
+    content = report.report(run, {'vertices': 0, 'faces': 0}, [])
     report.write(tmp_path / 'report.json', content)
     assert json.loads((tmp_path / 'report.json').read_text()) == json.loads(json.dumps(content))
     with pytest.raises(Gr2tError, match=r'cannot write .*report\.json/no'):

@@ -18,7 +18,8 @@ from gr2t_ros.core.reconstruction import Reconstruction, Update
 from gr2t_ros.core.view import View
 from gr2t_ros.errors import Gr2tError, InputError
 from gr2t_ros.io import snapshots
-from gr2t_ros.io.ply import read, write_views, Written
+from gr2t_ros.io.formats import read
+from gr2t_ros.io.ply import write_fused, Written
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
 
@@ -183,7 +184,7 @@ def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path)
     assert len(set(paths)) == 3
     for path in paths:
         assert path.parent == tmp_path / 'snapshots'
-        assert np.abs(read(path).mesh.vertices[:, 2]).max() < 0.02
+        assert np.abs(read(path).vertices[:, 2]).max() < 0.02
 
 
 def test_no_frame_waits_for_a_snapshot(
@@ -195,12 +196,12 @@ def test_no_frame_waits_for_a_snapshot(
     def slow(*arguments: Any, **options: Any) -> Written:
         busy.set()
         assert go.wait(LIMIT)
-        return write_views(*arguments, **options)
+        return write_fused(*arguments, **options)
 
     rig = make(keyframe_translation=0.0)
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
-    monkeypatch.setattr(snapshots, 'write_views', slow)
+    monkeypatch.setattr(snapshots, 'write_fused', slow)
     answer, later = rig.worker.saver.snapshot(), rig.worker.saver.snapshot()
     assert busy.wait(LIMIT)
     rig.feed()
@@ -208,8 +209,9 @@ def test_no_frame_waits_for_a_snapshot(
     rig.worker.reset()
     go.set()
     saved = answer.result(LIMIT)
-    assert set(read(saved.file.path).vertex_view) == set(range(COUNT))
-    likelihood = read(saved.file.path).mesh.vertex_likelihood
+    attributes = read(saved.file.path).attributes
+    assert attributes['views'].max() == COUNT
+    likelihood = attributes['likelihood']
     assert saved.likelihood == (likelihood.min(), likelihood.max())
     assert str(saved).startswith(f'{saved.file.path}: {saved.file.vertices} vertices, ')
     with pytest.raises(InputError, match='nothing to save'):
@@ -221,15 +223,14 @@ def test_a_stop_gives_up_what_is_being_written(
 ) -> None:
     """No part of a file stays; all who wait are told."""
     busy = threading.Event()
-    meshes = Reconstruction.meshes
+    fuse = Reconstruction.fuse
 
-    def slow(self: Reconstruction, stride: int = 1) -> Any:
+    def slow(self: Reconstruction) -> Any:
         busy.set()
-        for item in meshes(self, stride):
-            rig.wait(lambda: rig.worker._stop, 'the stop')
-            yield item
+        rig.wait(lambda: rig.worker._stop, 'the stop')
+        return fuse(self)
 
-    monkeypatch.setattr(Reconstruction, 'meshes', slow)
+    monkeypatch.setattr(Reconstruction, 'fuse', slow)
     rig = make()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
@@ -322,10 +323,12 @@ def test_what_leaves_memory_is_in_the_snapshots_folder(
     rig.wait(lambda: rig.outputs.changed >= set(range(WALL)), 'their meshes to be taken back')
     folder, = tmp_path.glob('snapshots/parts_*')
     assert rig.said(f'finished, each becomes a PLY file in {folder}') == 1
-    views = [set(read(path).vertex_view) for path in sorted(folder.iterdir())]
+    views = [set(read(path).attributes['view']) for path in sorted(folder.iterdir())]
     assert views == [{number} for number in range(WALL - 9)]
     saved = rig.worker.saver.snapshot().result(LIMIT)
-    assert set(read(saved.file.path).vertex_view) == set(range(WALL - 9, WALL))
+    along = read(saved.file.path).vertices[:, 0]  # half a metre a keyframe, which sees 0.64 m
+    assert along.min() == pytest.approx(0.5 * (WALL - 9) - 0.32, abs=0.05)
+    assert along.max() == pytest.approx(0.5 * (WALL - 1) + 0.32, abs=0.05)
     assert f'; {WALL - 9} keyframes that left memory are in {folder}: ' in str(saved)
     used, limit = rig.worker.memory
     assert 0 < used < limit

@@ -20,7 +20,16 @@ from numpy.typing import NDArray
 from ..settings import Settings
 from .blocks import key_of, place_of, places_of, with_keys
 from .compiled import run_all
-from .fused_grid import Grid, new_grid, sum_blocks, Views, views_of
+from .fused_grid import (
+    BYTES_PER_BLOCK,
+    Grid,
+    new_grid,
+    reached,
+    sum_blocks,
+    Views,
+    views_of,
+    without_empty,
+)
 from .fused_surface import surface, without_islands
 from .fused_view import Bandwidth, FusedView, spread
 from .new_density import voxel_size_for
@@ -75,6 +84,13 @@ class FusedMap:
         self._images: dict[View, FusedView] = {}
         self._grid = new_grid()
         self._change = 0
+        self._changed: list[NDArray[np.int64]] = []  # regions, (n, 3), that were not returned yet
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory it takes."""
+        return BYTES_PER_BLOCK * (self._grid.size - 1) + sum(
+            image.nbytes for image in self._images.values())
 
     @property
     def regions(self) -> list[Region]:
@@ -92,9 +108,10 @@ class FusedMap:
         :return: the regions whose mesh may have changed, each once
         """
         keyframes = [(view, rays) for view, rays in keyframes if len(rays.pixels)]
-        if density is None or not keyframes:
+        if density is None:
             return []
-        if self._voxel == 0:
+        self.keep(density, [view for view, _ in keyframes], pool)
+        if self._voxel == 0 and keyframes:
             self._voxel = (
                 density.voxel_size if isinstance(density, VoxelDensity)
                 else voxel_size_for(settings, keyframes[0][0])[0])
@@ -105,18 +122,47 @@ class FusedMap:
         self._images = {
             view: self._images.get(view) or FusedView(view.camera, settings.ray_stride)
             for view, _ in keyframes}
+        fresh = [(number, self._images[view], rays) for number, (view, rays)
+                 in enumerate(keyframes) if self._images[view].rounds != rays.rounds]
         keys = run_all(pool, FusedView.update, [
-            (self._images[view], density, rays, self._min_confidence, self._voxel)
-            for view, rays in keyframes if self._images[view].rounds != rays.rounds])
+            (image, density, rays, self._min_confidence, self._voxel)
+            for _, image, rays in fresh])
+        seen = self._seen(density)
+        self._sum(seen, run_all(pool, reached, [
+            (self._grid, some, *seen, number)
+            for some, (number, _, _) in zip(keys, fresh)]), pool)
+        changed, self._changed = self._changed, []
+        return _unique(np.concatenate([np.zeros((0, 3), np.int64), *changed]))
+
+    def keep(
+        self, density: Density, views: Sequence[View], pool: Executor | None
+    ) -> None:
+        """Forget all keyframes but some, and the blocks that are empty then."""
+        gone = set(self._images) - set(views)
+        if not gone:
+            return
+        seen, keys = self._seen(density), self._grid.key[1:self._grid.size]
+        touched = [
+            reached(new_grid(1), keys, *seen, number)
+            for number, view in enumerate(self._images) if view in gone]
+        self._images = {
+            view: image for view, image in self._images.items() if view not in gone}
+        self._sum(self._seen(density), touched, pool)
+        self._grid = without_empty(self._grid)
+
+    def _sum(
+        self, seen: tuple[Views, Bandwidth, Bandwidth, float], keys: list[NDArray[np.int64]],
+        pool: Executor | None,
+    ) -> None:
+        """Sum the blocks with some keys anew, and note which regions that changes."""
         if not keys:
-            return []
+            return
         self._change += 1
         self._grid, dirty = with_keys(
             self._grid, np.concatenate(keys), self._change, new=new_grid)
         run_all(pool, sum_blocks, [
-            (self._grid, dirty[i:i + _BLOCKS], *self._seen(density))
-            for i in range(0, len(dirty), _BLOCKS)])
-        return _unique(_regions_of(_before(self._grid, dirty)))
+            (self._grid, dirty[i:i + _BLOCKS], *seen) for i in range(0, len(dirty), _BLOCKS)])
+        self._changed.append(np.unique(_regions_of(_before(self._grid, dirty)), axis=0))
 
     def mesh(
         self, density: Density | None, pool: Executor | None,

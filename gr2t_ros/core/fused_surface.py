@@ -9,7 +9,6 @@ share the vertices at their borders. Edges are numbered 512 axis + voxel within 
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from math import sqrt
 from typing import NamedTuple
 
 from numba import int64, njit, uint64
@@ -17,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .blocks import place_of, SIDE, VOXELS
-from .climb import h3_at
 from .compiled import run_all, uncounted
-from .fused_grid import found_at, Grid, moved, sees, Views
+from .fused_grid import find_corners, Grid, moved, projected, said, sees, Views
 from .fused_view import Bandwidth
 from .marching_cubes import EDGE_AXIS, EDGE_CORNER, table
 
@@ -91,7 +89,7 @@ def surface(
         (grid, edges, i, min(i + _BLOCKS, len(edges.block)), voxel, vertices) for i in owners])
     run_all(pool, _judge, [
         (grid, edges, i, min(i + _BLOCKS, len(edges.block)), views, bandwidth, sigma, voxel,
-         vertices, sums, support) for i in owners])
+         vertices, sums, support, np.zeros((27, 4))) for i in owners])
     parts = [blocks[i:i + _BLOCKS] for i in range(0, len(blocks), _BLOCKS)]
     faces = run_all(pool, _triangles, [(grid, edges, part, table()) for part in parts])
     joined = np.concatenate([np.zeros((0, 3), np.int32), *faces])
@@ -336,28 +334,30 @@ def _place(
 def _judge(
     grid: Grid, edges: _Edges, first: int, end: int, views: Views, bandwidth: Bandwidth,
     sigma: Bandwidth, voxel: float, vertices: Doubles, sums: Doubles, support: Ints,
+    corners: Doubles,
 ) -> None:
     """Add up what the views say of the vertices of some blocks: weights, sigmas, confidences."""
-    middle = 0.5 * SIDE * voxel
-    radius = middle * sqrt(3.0)
+    side = SIDE * voxel
     for owner in range(first, end):
         begin, stop = edges.first[owner], edges.first[owner + 1]
         if begin == stop:
             continue
         x, y, z = place_of(grid.key[edges.block[owner]])
         for view in range(len(views.stride)):
-            T = views.T_camera_world[view]
-            centre = moved(
-                T, x * SIDE * voxel + middle, y * SIDE * voxel + middle,
-                z * SIDE * voxel + middle)
-            if not sees(views, view, sigma, centre, radius):
+            find_corners(views, view, x * side, y * side, z * side, side, corners)
+            if not sees(views, view, sigma, corners, 0, 2):
                 continue
+            T = views.T_camera_world[view]
             for vertex in range(begin, stop):
                 at = moved(T, vertices[vertex, 0], vertices[vertex, 1], vertices[vertex, 2])
-                weight, _, depth, cosine, confidence = found_at(
-                    views, view, bandwidth, sigma, at[0], at[1], at[2])
+                before, u, v = projected(views, view, at[0], at[1], at[2])
+                if not before:
+                    continue
+                weight, _, h3, cosine, confidence = said(
+                    views.address[view, 0], views.size[view, 0], views.size[view, 1], bandwidth,
+                    sigma, u, v, at[0], at[1], at[2])
                 if weight > 0:
-                    along = h3_at(bandwidth, depth) * (1.0 / max(confidence, 0.002) - 1.0)
+                    along = h3 * (1.0 / max(confidence, 0.002) - 1.0)
                     support[vertex] += 1
                     sums[vertex, 0] += weight
                     sums[vertex, 1] += weight * along * cosine

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from math import sqrt
 
+import cv2
 from numba import int64, njit, uint64
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +34,8 @@ PIXEL = np.dtype([
 AGREEMENT = 1 << 14
 _MIN_AGREEMENT = 0.05  # less is what an outlier has
 JUMP = 4.0  # h3 between neighbours that lie on different surfaces
-TILE = 8  # pixels; side of the squares whose depths are known
-REACH = 6.0  # sigma about a maximum within which it counts
+TILE = 4  # pixels; side of the squares whose depths are known
+REACH = 4.0
 _HALO = 2  # pixels about a tile that have a part in what lies within it
 _BITS = 64
 
@@ -65,7 +66,13 @@ class FusedView:
         self.pixels = np.zeros((height, width), PIXEL)
         self.tiles = np.zeros((-(-height // TILE), -(-width // TILE), 2), np.float32)
         self._marches = np.zeros(0, np.uint16)
+        self.depth = (np.inf, -np.inf)
         self._margin = 2.0 * stride / min(camera.fx, camera.fy)
+
+    @property
+    def nbytes(self) -> int:
+        """Return the memory it takes."""
+        return self.pixels.nbytes + self.tiles.nbytes + self._marches.nbytes
 
     @property
     def addresses(self) -> tuple[int, int]:
@@ -96,28 +103,33 @@ class FusedView:
         depth = rays.depth[which]
         confidence = confidences(sigma, density.h3(depth))
         agreement[~rays.converged[which] | (confidence < min_confidence)] = 0
-        changed = np.zeros(self.pixels.shape, np.bool_)
+        changed = np.zeros(self.pixels.shape, np.uint8)
         v, u = np.divmod(rays.pixels[which], rays.table.shape[1])
         _enter(
             self.pixels, v // self.stride, u // self.stride, depth, agreement, confidence,
             changed)
-        _turn(self.pixels, self._table, density.bandwidth, changed)
+        about = np.asarray(cv2.dilate(changed, np.ones((3, 3), np.uint8)), np.uint8)
+        _turn(self.pixels, self._table, density.bandwidth, about)
         _measure(self.pixels, self.tiles)
+        sigma_here = spread(density.bandwidth, voxel)
+        near, far = float(self.tiles[..., 0].min()), float(self.tiles[..., 1].max())
+        reach = REACH * h3_at(sigma_here, far)
+        self.depth = (near - reach, far + reach)
         T = rays.T_world_camera
         return _keys(
-            self.pixels, depth_before, changed, self._table, self._margin, T[:3, :3].copy(),
-            T[:3, 3].copy(), spread(density.bandwidth, voxel), SIDE * voxel)
+            self.pixels, depth_before, about, self._table, self._margin, T[:3, :3].copy(),
+            T[:3, 3].copy(), sigma_here, SIDE * voxel)
 
 
 @njit(cache=True, nogil=True)
 def _enter(
     pixels: NDArray[np.void], v: NDArray[np.int32], u: NDArray[np.int32], depth: Floats,
-    agreement: Floats, confidence: Floats, changed: NDArray[np.bool_],
+    agreement: Floats, confidence: Floats, changed: NDArray[np.uint8],
 ) -> None:
     """Write the rays' results into the image."""
     for n in range(len(v)):
         pixel = pixels[v[n], u[n]]
-        changed[v[n], u[n]] = True
+        changed[v[n], u[n]] = 1
         pixel['depth'] = depth[n]
         counts = agreement[n] >= _MIN_AGREEMENT
         pixel['agreement'] = min(int(agreement[n] * AGREEMENT), 65535) if counts else 0
@@ -126,15 +138,13 @@ def _enter(
 
 @njit(cache=True, nogil=True)
 def _turn(
-    pixels: NDArray[np.void], table: Doubles, bandwidth: Bandwidth, changed: NDArray[np.bool_]
+    pixels: NDArray[np.void], table: Doubles, bandwidth: Bandwidth, changed: NDArray[np.uint8]
 ) -> None:
-    """Compute the frontality of the pixels that have changed, and of their neighbours."""
+    """Compute the frontality of the pixels that have changed, or whose neighbours have."""
     height, width = pixels.shape
     for v in range(height):
         for u in range(width):
-            if pixels[v, u]['agreement'] == 0:
-                continue
-            if not changed[max(v - 1, 0):v + 2, max(u - 1, 0):u + 2].any():
+            if pixels[v, u]['agreement'] == 0 or changed[v, u] == 0:
                 continue
             pixels[v, u]['frontality'] = int(
                 255 * _frontality(pixels, table, bandwidth, v, u) + 0.5)
@@ -162,13 +172,13 @@ def _slope(
     """Return the way from the pixel before to the one after, on one surface; 0 where none is."""
     height, width = pixels.shape
     depth = pixels[v, u]['depth']
-    ends = [(v, u), (v, u)]
-    for n in range(2):
-        to_v, to_u = v + (2 * n - 1) * down, u + (2 * n - 1) * across
-        if 0 <= to_v < height and 0 <= to_u < width and pixels[to_v, to_u]['agreement'] > 0 and (
-                abs(pixels[to_v, to_u]['depth'] - depth) <= most):
-            ends[n] = (to_v, to_u)
-    (v0, u0), (v1, u1) = ends
+    v0, u0, v1, u1 = v - down, u - across, v + down, u + across
+    if v0 < 0 or u0 < 0 or pixels[v0, u0]['agreement'] == 0 or not (
+            abs(pixels[v0, u0]['depth'] - depth) <= most):
+        v0, u0 = v, u
+    if v1 >= height or u1 >= width or pixels[v1, u1]['agreement'] == 0 or not (
+            abs(pixels[v1, u1]['depth'] - depth) <= most):
+        v1, u1 = v, u
     z0, z1 = pixels[v0, u0]['depth'], pixels[v1, u1]['depth']
     return (
         z1 * table[v1, u1, 0] - z0 * table[v0, u0, 0],
@@ -190,7 +200,7 @@ def _measure(pixels: NDArray[np.void], tiles: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def _keys(
-    pixels: NDArray[np.void], before: Floats, changed: NDArray[np.bool_], table: Doubles,
+    pixels: NDArray[np.void], before: Floats, changed: NDArray[np.uint8], table: Doubles,
     margin: float, R_world_camera: Doubles, t_world_camera: Doubles, sigma: Bandwidth,
     block: float,
 ) -> NDArray[np.int64]:
@@ -198,16 +208,17 @@ def _keys(
     Return the keys of the blocks in which changed pixels count, or counted.
 
     :param before: (h, w) their depths before, NaN where they did not count
+    :param changed: (h, w) not 0 where a pixel or a neighbour has changed
     :param margin: more than the slope between the rays of neighbours
     """
     height, width = pixels.shape
     out, count = np.zeros(4096, np.int64), 0
+    recent = np.full(16, -1, np.int64)
     origin = t_world_camera / block
     for v0 in range(0, height, TILE):
         for u0 in range(0, width, TILE):
             v1, u1 = min(v0 + TILE, height), min(u0 + TILE, width)
-            # a neighbour's frontality has changed too, and beyond it lies what that has a part in
-            if not changed[max(v0 - 1, 0):v1 + 1, max(u0 - 1, 0):u1 + 1].any():
+            if not changed[v0:v1, u0:u1].any():
                 continue
             near, far = np.inf, -np.inf
             for v in range(max(v0 - _HALO, 0), min(v1 + _HALO, height)):
@@ -237,8 +248,12 @@ def _keys(
                 for z in range(z0, z1 + 1):
                     for y in range(y0, y1 + 1):
                         for x in range(x0, x1 + 1):
+                            key = key_of(x, y, z)
+                            if (recent == key).any():
+                                continue
+                            recent[count % len(recent)] = key
                             out = with_room(out, count)
-                            out[count] = key_of(x, y, z)
+                            out[count] = key
                             count += 1
     return out[:count]
 

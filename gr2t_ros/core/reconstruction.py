@@ -99,8 +99,8 @@ class Reconstruction:
     :param sink: takes the meshes of keyframes that leave where max_memory_mb is full, as
         MemoryBound has it; without one there is no bound; may be set
 
-    `keyframes` are the views that own a mesh, `density` is what all views built, `stamp_ns` is the
-    newest stamp of these views.
+    `keyframes` are the views that own a mesh, `density` is what all views built, `fused` makes one
+    mesh of the keyframes where it is asked to, `stamp_ns` is the newest stamp of these views.
     """
 
     def __init__(self, settings: Settings, sink: Sink | None = None) -> None:
@@ -110,7 +110,7 @@ class Reconstruction:
         self.sink = sink
         self._bound = MemoryBound()
         self._density: Density | None = None
-        self._fused = FusedMap()
+        self.fused = FusedMap()
         self._noticed: set[str] = set()
         self._pool: Executor | None = ThreadPoolExecutor(
             settings.threads or os.cpu_count() or 1, thread_name_prefix='gr2t')
@@ -231,22 +231,18 @@ class Reconstruction:
 
         :return: the regions whose mesh may have changed since the last call
         """
-        return self._fused.update(
+        return self.fused.update(
             self._density, [(keyframe.view, keyframe.rays) for keyframe in self.keyframes],
             self.settings, self._pool)
 
     @property
     def fused_regions(self) -> list[Region]:
         """Return all regions of the fused map, as it was fused last."""
-        return self._fused.regions
+        return self.fused.regions
 
     def fused_region(self, region: Region) -> SurfaceMesh:
-        """
-        Return the fused mesh in a region, as it was fused last.
-
-        Each triangle is in one region, the vertices at their borders are in several.
-        """
-        return self._fused.mesh(self._density, self._pool, region=region)
+        """Return a region's mesh, as it was fused last; borders share vertices, no triangles."""
+        return self.fused.mesh(self._density, self._pool, region=region)
 
     def fused_mesh(self, min_component: int = MIN_COMPONENT) -> SurfaceMesh:
         """
@@ -255,7 +251,7 @@ class Reconstruction:
         :param min_component: triangles; connected parts that have fewer are left out
         """
         self.fuse()
-        return self._fused.mesh(self._density, self._pool, min_component)
+        return self.fused.mesh(self._density, self._pool, min_component)
 
     def colouring(self) -> Colouring:
         """Return how points are coloured, up to the robust maximum over all keyframes."""
@@ -276,7 +272,7 @@ class Reconstruction:
         """
         twin = copy(self)
         twin._pool, twin._bound, twin.sink = None, MemoryBound(), None
-        twin._fused = FusedMap()  # it is made again from the same rays, where it is wanted
+        twin.fused = FusedMap()  # it is made again from the same rays, where it is wanted
         if self._density is not None:
             self._density.refresh(self._pool)
             twin._density = frozen(self._density, room, fields)

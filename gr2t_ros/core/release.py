@@ -101,6 +101,8 @@ class MemoryBound:
                 f'written out: {self._failure}'))
         _empty(engine.keyframes[number])
         self._news.append(number)
+        engine.fused.keep(engine.density, [
+            keyframe.view for keyframe in engine.keyframes if not keyframe.released], engine.pool)
         _forget_blocks(engine)
 
 
@@ -112,10 +114,11 @@ def limit_of(settings: Settings) -> int:
 
 
 def used_by(engine: Reconstruction) -> int:
-    """Return the bytes of a map: blocks, also as copied for a snapshot, keyframes, exact views."""
+    """Return a map's bytes: blocks, also as copied for a snapshot, keyframes, the fused map."""
     if not engine.keyframes:
         return 0
-    return bytes_of_density(engine.density) + sum(map(bytes_of_keyframe, engine.keyframes))
+    return bytes_of_density(engine.density) + engine.fused.nbytes + sum(
+        map(bytes_of_keyframe, engine.keyframes))
 
 
 def bytes_of_density(density: Density) -> int:

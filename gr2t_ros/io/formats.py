@@ -19,7 +19,7 @@ from . import ply
 from .files import whole_file
 
 # what a mesh of this package says of its vertices, where a file holds it
-ATTRIBUTES = ('likelihood', 'sigma', 'confidence', 'views')
+ATTRIBUTES = ('likelihood', 'sigma', 'confidence', 'views', 'view')
 # file ending -> what the format cannot hold
 WRITTEN = {
     '.ply': '',
@@ -132,7 +132,7 @@ def write(path: Path, mesh: Mesh) -> None:
     check_ending(path)
     ending, vertices, colours = path.suffix.lower(), mesh.vertices, mesh.colours
     if ending == '.ply':
-        ply.write_surface(path, vertices, mesh.faces, colours, mesh.attributes)
+        ply.write_mesh(path, vertices, mesh.faces, colours, mesh.attributes)
         return
     visual: Any = None
     attributes: dict[str, NDArray[np.float32]] = {}

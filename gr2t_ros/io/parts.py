@@ -10,10 +10,9 @@ import time
 from ..core.colour import Colouring
 from ..core.view_mesh import ViewMesh
 from ..errors import Gr2tError
-from .ply import write_views
+from .ply import write_view
 
 _NAME = 'view_{:06d}.ply'
-_ALL = 1 << 62  # faces: a part is never decimated
 
 
 class Parts:
@@ -42,8 +41,7 @@ class Parts:
             except OSError as error:
                 raise Gr2tError(
                     f'cannot make the folder {error.filename}: {error.strerror}') from error
-        written = write_views(
-            self.directory / _NAME.format(number), lambda _: [(number, mesh)], colouring, _ALL)
+        written = write_view(self.directory / _NAME.format(number), number, mesh, colouring)
         self.keyframes += 1
         self.vertices += written.vertices
         self.edges += written.edges

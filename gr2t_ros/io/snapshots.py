@@ -1,19 +1,16 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""Snapshots: the map as a PLY file with a new name each time."""
+"""Snapshots: the map's fused mesh as a PLY file with a new name each time."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 import time
 
-import numpy as np
-
 from ..core.reconstruction import Reconstruction
-from ..core.view_mesh import ViewMesh
 from ..errors import Gr2tError, InputError
 from .files import Folder
-from .ply import write_views, Written
+from .ply import write_fused, Written
 
 _STEP = 0.2  # s of marching between two looks at whether to go on
 
@@ -35,11 +32,10 @@ class Snapshot:
     def __str__(self) -> str:
         """Return the path, ': ' and what the file holds."""
         file = self.file
-        stride = f', every {file.stride}th ray' if file.stride > 1 else ''
         return (
-            f'{file.path}: {file.vertices} vertices, {file.edges} edges, {file.faces} faces'
-            f'{stride}, likelihood {self.likelihood[0]:.3g} to {self.likelihood[1]:.3g} '
-            '/ (px^2 m)' + (f'; {self.elsewhere}' if self.elsewhere else ''))
+            f'{file.path}: {file.vertices} vertices, {file.faces} faces, '
+            f'likelihood {self.likelihood[0]:.3g} to {self.likelihood[1]:.3g} / (px^2 m)'
+            + (f'; {self.elsewhere}' if self.elsewhere else ''))
 
 
 def save_snapshot(
@@ -47,7 +43,7 @@ def save_snapshot(
     interrupted: Callable[[], bool] = lambda: False,
 ) -> Snapshot:
     """
-    March all rays that wait, and write all keyframes' meshes into a new file named after the time.
+    March all rays that wait, and write the fused mesh into a new file named after the time.
 
     Names are never used twice, since viewers keep a mesh by its name.
 
@@ -63,23 +59,15 @@ def save_snapshot(
         if interrupted():
             raise Gr2tError('interrupted: the node was told to stop')
 
-    ranges: list[tuple[float, float]] = []
-
-    def meshes(stride: int) -> Iterator[tuple[int, ViewMesh]]:
-        ranges.clear()
-        for number, mesh in reconstruction.meshes(stride):
-            go_on()
-            if len(mesh.vertices):
-                likelihood = mesh.vertex_likelihood
-                ranges.append((float(likelihood.min()), float(likelihood.max())))
-            yield number, mesh
-
     while reconstruction.finish(_STEP).waiting:
         go_on()
-    expected = sum(
-        int(np.count_nonzero(keyframe.rays.converged)) for keyframe in reconstruction.keyframes)
+    reconstruction.fuse()
+    go_on()
+    mesh = reconstruction.fused_mesh()
+    go_on()
     with folder.new_file(time.strftime('mesh_%Y%m%d_%H%M%S'), '.ply') as path:
-        file = write_views(
-            path, meshes, reconstruction.colouring(), expected_vertices=expected)
-    low, high = zip(*ranges) if ranges else ((0.0,), (0.0,))
-    return Snapshot(file, (min(low), max(high)))
+        file = write_fused(path, mesh, reconstruction.colouring())
+    likelihood = mesh.vertex_likelihood
+    if not len(likelihood):
+        return Snapshot(file, (0.0, 0.0))
+    return Snapshot(file, (float(likelihood.min()), float(likelihood.max())))

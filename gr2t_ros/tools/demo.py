@@ -24,9 +24,9 @@ import numpy as np
 import trimesh
 
 from ..core.colour import Colouring
-from ..core.view_mesh import ROBUST_MAXIMUM, ViewMesh
+from ..core.view_mesh import ROBUST_MAXIMUM
 from ..errors import Gr2tError, InputError
-from ..io.ply import read
+from ..io import formats
 from ..ros.client import Client
 from ..ros.isolation import isolated
 from ..settings import Settings
@@ -179,21 +179,22 @@ class _Demo:
                 client.save_snapshot()
                 _wait(saved, 'the snapshot', node).replace(self._mesh)
 
-    def _measure(self, scene: trimesh.Trimesh) -> tuple[ViewMesh, np.ndarray]:
+    def _measure(self, scene: trimesh.Trimesh) -> tuple[formats.Mesh, np.ndarray]:
         """Draw the mesh; return it and its vertices' distances to the true surface, metres."""
-        mesh = read(self._mesh).mesh
+        mesh = formats.read(self._mesh)
+        likelihood, sigma = mesh.attributes['likelihood'], mesh.attributes['sigma']
         settings = Settings()
         colouring = Colouring(
-            settings.color_by, float(np.percentile(mesh.vertex_likelihood, ROBUST_MAXIMUM)),
+            settings.color_by, float(np.percentile(likelihood, ROBUST_MAXIMUM)),
             settings.colour_map)
         distance = Surface(scene.triangles).distances(mesh.vertices)
         preview(
-            self._picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, mesh.vertex_sigma,
+            self._picture, mesh.vertices, mesh.faces, likelihood, sigma,
             colouring, title='gr2t_ros: a simulated tabletop, mapped live',
             poses=self._poses)
         return mesh, distance
 
-    def _report(self, mesh: ViewMesh, distance: np.ndarray, seconds: float) -> None:
+    def _report(self, mesh: formats.Mesh, distance: np.ndarray, seconds: float) -> None:
         print(f'\nmesh      {self._mesh}\n'
               f'          {len(mesh.vertices)} vertices, {len(mesh.faces)} faces\n'
               f'picture   {self._picture}')

@@ -21,6 +21,8 @@ class Progress:
     """
     Progress of a job; a context manager.
 
+    done: steps so far.
+
     :param total: steps; an estimate will do
     :param unit: what is counted
     """
@@ -28,7 +30,7 @@ class Progress:
     def __init__(self, total: int, unit: str) -> None:
         self._total = total
         self._unit = unit
-        self._done = 0
+        self.done = 0
         self._begin = self._said = monotonic()
         self._bar = tqdm(
             total=total, unit=f' {unit}', file=sys.stderr, dynamic_ncols=True,
@@ -36,8 +38,8 @@ class Progress:
 
     def reach(self, done: int) -> None:
         """Say that so many steps are done."""
-        self._bar.update(done - self._done)
-        self._done = done
+        self._bar.update(done - self.done)
+        self.done = done
         now = monotonic()
         if self._bar.disable and now - self._said > _LOG_PERIOD:
             self._said = now

@@ -62,7 +62,7 @@ def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[s
     """
     Return the content of report.json.
 
-    :param counts: vertices, edges and faces of the mesh that was written; parts that left memory
+    :param counts: vertices and faces of the mesh that was written; parts that left memory
         before have their own
     :param likelihood: (n,) of its vertices
     """

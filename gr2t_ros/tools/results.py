@@ -1,6 +1,6 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
-"""What a replay leaves: mesh.ply, preview.png, report.json, a mesh for each view, the map."""
+"""What a replay leaves: mesh, picture, cameras, report, a mesh for each view, the map."""
 from __future__ import annotations
 
 from collections.abc import Iterator
@@ -8,12 +8,10 @@ import os
 from pathlib import Path
 from time import perf_counter
 
-import numpy as np
-
+from ..core.colour import Colouring
 from ..core.compiled import cache_notice
 from ..core.next_views import where_next
 from ..core.reconstruction import Reconstruction, Update, warm_up
-from ..core.view_mesh import ViewMesh
 from ..errors import InputError
 from ..io import ply, trajectory
 from ..io.map_file import MapFile, save_map
@@ -104,84 +102,55 @@ def write_results(
     """
     begin = perf_counter()
     say(f'writing {directory} ...')
-    meshes = _Meshes(reconstruction, run, directory / 'views' if per_view else None)
-    written = ply.write_views(
-        directory / 'mesh.ply', meshes.all, meshes.colouring,
-        expected_vertices=meshes.expected)
-    counts = {'vertices': written.vertices, 'edges': written.edges, 'faces': written.faces}
-    results = {str(written.path): ', '.join(f'{n} {name}' for name, n in counts.items())}
-    if written.stride > 1:
-        results[str(written.path)] += (
-            f'; decimated by {written.stride} in rows and columns, to at most {ply.MAX_FACES} '
-            'faces')
+    colouring = reconstruction.colouring()
+    started = perf_counter()
+    mesh = reconstruction.fused_mesh()
+    run.seconds['mesh'] = [perf_counter() - started]
+    written = ply.write_fused(directory / 'mesh.ply', mesh, colouring)
+    results = {str(written.path): f'{written.vertices} vertices, {written.faces} faces'}
     if run.parts.directory:
-        results[str(written.path)] += f'; the {reconstruction.kept} keyframes still in memory'
+        results[str(written.path)] += f'; of the {reconstruction.kept} keyframes still in memory'
         results[str(run.parts.directory)] = (
             f'the other {run.parts.keyframes} keyframes, finished, a file each: '
             f'{run.parts.vertices} vertices, {run.parts.edges} edges, {run.parts.faces} faces')
     if per_view:
-        meshes.write_other_views()
-        results[str(directory / 'views')] = f'{reconstruction.kept} keyframes'
+        results[str(directory / 'views')] = _write_views(
+            reconstruction, directory / 'views', colouring)
+    poses = [item.view.T_world_camera for item in reconstruction.keyframes]
     cameras = directory / 'cameras.txt'
-    trajectory.write(cameras, (
-        (item.view.stamp_ns, item.view.T_world_camera) for item in reconstruction.keyframes))
-    results[str(cameras)] = f'poses of {len(reconstruction.keyframes)} keyframes'
-    mesh = ply.read(written.path).mesh
+    trajectory.write(cameras, zip(
+        [item.view.stamp_ns for item in reconstruction.keyframes], poses))
+    results[str(cameras)] = f'poses of {len(poses)} keyframes'
     picture = directory / 'preview.png'
     preview(
         picture, mesh.vertices, mesh.faces, mesh.vertex_likelihood, mesh.vertex_sigma,
-        meshes.colouring, title=title,
-        poses=[item.view.T_world_camera for item in reconstruction.keyframes])
+        colouring, title=title, poses=poses)
     results[str(picture)] = ''
     if with_map:
         saved = save_map(directory / MAP_NAME, reconstruction, run.settings.world_frame)
         results[str(saved.path)] = saved.content
     run.next_views = where_next(reconstruction).views
     run.finish_seconds += perf_counter() - begin
-    content = report.report(run, counts, mesh.vertex_likelihood)
+    content = report.report(
+        run, {'vertices': written.vertices, 'faces': written.faces}, mesh.vertex_likelihood)
     report.write(directory / 'report.json', content)
     results[str(directory / 'report.json')] = ''
     return report.table(content, run, results)
 
 
-class _Meshes:
-    """The keyframes' meshes, timed; each goes to a file of its own when it is first made."""
-
-    def __init__(
-        self, reconstruction: Reconstruction, run: report.Run, views: Path | None
-    ) -> None:
-        self.colouring = reconstruction.colouring()
-        self.expected = sum(
-            int(np.count_nonzero(item.rays.converged)) for item in reconstruction.keyframes)
-        self._reconstruction = reconstruction
-        self._run = run
-        self._views = views
-        self._written: set[int] = set()
-
-    def all(self, stride: int) -> Iterator[tuple[int, ViewMesh]]:
-        """Yield them in order, as ply.write_views wants it."""
-        seconds = self._run.seconds['mesh'] = []
-        count = len(self._reconstruction.keyframes)
-        with Progress(count, 'meshes') as bar:
-            for number in range(count):
-                begin = perf_counter()
-                mesh = self._reconstruction.mesh(number, stride)
-                seconds.append(perf_counter() - begin)
-                if stride == 1:
-                    self._write_view(number, mesh)
-                bar.reach(number + 1)
-                yield number, mesh
-
-    def write_other_views(self) -> None:
-        """Write the files of those that were made decimated only."""
-        for number in range(len(self._reconstruction.keyframes)):
-            if number not in self._written:
-                self._write_view(number, self._reconstruction.mesh(number))
-
-    def _write_view(self, number: int, mesh: ViewMesh) -> None:
-        def strided(stride: int) -> list[tuple[int, ViewMesh]]:
-            return [(number, mesh if stride == 1 else self._reconstruction.mesh(number, stride))]
-        if self._views is not None and not self._reconstruction.keyframes[number].released:
-            ply.write_views(
-                self._views / f'view_{number:04d}.ply', strided, self.colouring)
-            self._written.add(number)
+def _write_views(reconstruction: Reconstruction, directory: Path, colouring: Colouring) -> str:
+    """Write the mesh of each keyframe that is in memory; say what there is now."""
+    vertices = edges = faces = 0
+    with Progress(reconstruction.kept, 'meshes') as bar:
+        for number, keyframe in enumerate(reconstruction.keyframes):
+            if keyframe.released:
+                continue
+            written = ply.write_view(
+                directory / f'view_{number:04d}.ply', number, reconstruction.mesh(number),
+                colouring)
+            vertices += written.vertices
+            edges += written.edges
+            faces += written.faces
+            bar.reach(bar.done + 1)
+    return (f'{reconstruction.kept} keyframes, a file each: {vertices} vertices, {edges} edges, '
+            f'{faces} faces')
