@@ -39,7 +39,7 @@ from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.state import ADDING
 from gr2t_ros.core.view import View
 from gr2t_ros.errors import Gr2tError
-from gr2t_ros.io import ply
+from gr2t_ros.io import formats
 from gr2t_ros.io.files import Folder
 from gr2t_ros.io.map_file import ENDING, MapFile, save_map
 from gr2t_ros.io.snapshots import save_snapshot
@@ -99,7 +99,7 @@ class Folders:
             with MapFile(path) as file, closing(Reconstruction(file.settings)) as reconstruction:
                 file.load(reconstruction)
         else:
-            ply.read(path)
+            formats.read(path)
 
 
 def kill_writers(folders: Folders, kills: int, frames: Path) -> None:
