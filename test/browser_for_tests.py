@@ -49,10 +49,14 @@ class Browser:
         self._call('Network.emulateNetworkConditions', offline=True, latency=0,
                    downloadThroughput=0, uploadThroughput=0)
 
-    def open(self, page: Path) -> float:
-        """Load a page; return the seconds until its mesh is shown."""
-        began = time.monotonic()
+    def go(self, page: Path) -> None:
+        """Load a page."""
         self._call('Page.navigate', url=page.resolve().as_uri())
+
+    def open(self, page: Path) -> float:
+        """Load a page of `gr2t view`; return the seconds until its mesh is shown."""
+        began = time.monotonic()
+        self.go(page)
         self.until("document.readyState === 'complete' && "
                    "document.getElementById('message').hidden")
         self.settle()

@@ -43,7 +43,8 @@ class Progress:
         now = monotonic()
         if self._bar.disable and now - self._said > _LOG_PERIOD:
             self._said = now
-            say(f'{done} of {self._total} {self._unit}, {now - self._begin:.0f} s')
+            seconds = now - self._begin
+            say(f'{done} of {self._total} {self._unit}, {seconds:.0f} s, {done / seconds:.1f}/s')
 
     def __enter__(self) -> Progress:
         return self

@@ -41,6 +41,7 @@ def preview(
     colouring: Colouring,
     title: str = '',
     poses: Sequence[Pose] = (),
+    T_world_camera: Pose | None = None,
     width: int = 1280,
     height: int = 800,
 ) -> None:
@@ -55,6 +56,7 @@ def preview(
     :param colouring: which of the two is shown
     :param title: a line below the picture
     :param poses: (4, 4) T_world_camera of the cameras that scanned it; without them z is up
+    :param T_world_camera: (4, 4) the place to look from, where it is known
     :param width: of the picture, pixels; likewise height, to which a footer is added
     :raises Gr2tError: if the file cannot be written
     """
@@ -66,7 +68,8 @@ def preview(
     faces = (np.cumsum(used, dtype=np.int32) - 1)[faces]
     vertices = vertices[used]
     colours = colouring.colours(np.asarray(likelihood)[used], np.asarray(sigma)[used])
-    T_world_camera = good_view(vertices, faces, poses, FOCAL, height / width)
+    if T_world_camera is None:
+        T_world_camera = good_view(vertices, faces, poses, FOCAL, height / width)
     picture = render(vertices, faces, colours, T_world_camera, width, height)
     figure = _framed(picture, colouring, title)
     with whole_file(path) as stream:

@@ -28,6 +28,7 @@ from ..settings import Settings
 from . import options, report
 from .cli import DONE, INTERRUPTED
 from .info import depth_text, poses_text
+from .live import Live
 from .progress import Progress, say
 from .results import (
     load,
@@ -74,6 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--resume', metavar='MAP', type=Path, help='go on with a saved map, a file or the folder '
         'of a replay, with its parameters; images up to its newest are passed over')
+    parser.add_argument(
+        '--live', action='store_true', help='show the map as it grows: DIR/live.html is a page '
+        'with a picture that is new every few seconds, for a tenth of the time at most')
     options.add_arguments(parser)
 
 
@@ -132,8 +136,9 @@ def run(args: argparse.Namespace) -> int:
                 print(write_results(
                     reconstruction, done, directory, title, per_view=args.per_view,
                     with_map=args.save_map))
+            live = Live(directory, reconstruction) if args.live else None
             try:
-                interrupted = _Replay(args, bag, sources, reconstruction, done).read()
+                interrupted = _Replay(args, bag, sources, reconstruction, done, live).read()
             except Exception:
                 if done.integrated:
                     say('it failed; what was done is kept')
@@ -172,13 +177,14 @@ class _Replay:
 
     def __init__(
         self, args: argparse.Namespace, bag: Bag, sources: topics.Sources,
-        reconstruction: Reconstruction, done: report.Run,
+        reconstruction: Reconstruction, done: report.Run, live: Live | None,
     ) -> None:
         self._args = args
         self._bag = bag
         self._sources = sources
         self._reconstruction = reconstruction
         self._done = done
+        self._live = live
         self._said = False
         # of the map that it goes on with
         self._newest_ns = reconstruction.stamp_ns if reconstruction.views else -1
@@ -206,6 +212,8 @@ class _Replay:
                     self._add(view)
                     done.seconds['total'].append(perf_counter() - started)
                     bar.reach(assembler.read)
+                    if self._live:
+                        self._live.reach(assembler.read, self._expected())
         finally:
             done.loop_seconds = perf_counter() - begin
             done.dropped += assembler.dropped
