@@ -24,7 +24,7 @@ Call = Callable[..., tuple[int, str, str]]
 def gr2t(capsys: pytest.CaptureFixture[str], tmp_path: Path,
          monkeypatch: pytest.MonkeyPatch) -> Call:
     """Return the command line as a function to exit code, stdout and stderr."""
-    monkeypatch.setattr('gr2t_ros.tools.replay.warm_up', lambda _: 0.0)
+    monkeypatch.setattr('gr2t_ros.tools.results.warm_up', lambda _: 0.0)
     monkeypatch.chdir(tmp_path)
 
     def call(*arguments: Any) -> tuple[int, str, str]:
