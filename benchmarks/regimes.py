@@ -16,6 +16,7 @@ from contextlib import closing
 from dataclasses import dataclass
 import json
 from pathlib import Path
+from time import thread_time
 from typing import Any
 
 from common import machine, table
@@ -217,28 +218,37 @@ def _pixels_of_mesh(
 
 
 def starts(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regime) -> Row:
-    """Return what the robust start does to outliers and to other pixels."""
-    outliers = back = others = moved = 0
+    """Return what becomes of outliers with the robust start, and what it does to other pixels."""
+    close, unit = max(NEAR, 2 * regime.sigma), max(NEAR, regime.sigma)
+    outliers = back = along = others = moved = 0
+    seconds = {'robust': 0.0, 'observed': 0.0}
     for keyframe in reconstruction.keyframes:
-        true = truth.depth(keyframe.view).reshape(-1)
-        rays = rays_of(reconstruction.density, keyframe.view, 1, 'robust')
-        off = keyframe.view.depth.reshape(-1)[rays.pixels] - true[rays.pixels]
-        after = rays.start - true[rays.pixels]
-        far = np.abs(off) > 5 * max(regime.sigma, NEAR)
-        outliers += int(far.sum())
-        close = max(NEAR, 2 * regime.sigma)
-        found = np.full(len(true), np.nan)
-        found[keyframe.rays.pixels] = np.where(
-            keyframe.rays.converged, keyframe.rays.depth, np.nan)
-        ended = np.abs(found[rays.pixels] - true[rays.pixels])
-        back += int((far & (ended < close)).sum())
-        inlier = np.abs(off) < 3 * max(regime.sigma, NEAR)
+        rays = keyframe.rays
+        # a frame that was just added has its warped image already
+        rays_of(reconstruction.density, keyframe.view, 1, 'robust')
+        for start in seconds:
+            began = thread_time()
+            rays_of(reconstruction.density, keyframe.view, 1, start)
+            seconds[start] += thread_time() - began
+        true = truth.depth(keyframe.view).reshape(-1)[rays.pixels]
+        observed = keyframe.view.depth.reshape(-1)[rays.pixels]
+        off = np.abs(observed - true)
+        ended = np.where(rays.converged, np.abs(rays.depth - true), np.inf)
+        far = np.flatnonzero(off > 5 * unit)
+        outliers += len(far)
+        found = far[rays.converged[far]]
+        back += int(np.sum(truth.surface.distances(rays.points(found)) <= NEAR))
+        along += int(np.sum(ended[far] < close))
+        inlier = off < 3 * unit
         others += int(inlier.sum())
-        moved += int((inlier & (np.abs(after) > 5 * max(regime.sigma, NEAR))).sum())
+        moved += int(np.sum(inlier & (rays.start != observed) & (ended > 5 * unit)))
     return {
         'noise': name, 'outliers': outliers,
-        'brought back %': _percent(back, outliers),
-        'inliers': others, 'moved %': _percent(moved, others)}
+        'end within 1 mm of the surface %': _percent(back, outliers),
+        'along the ray within 2 sigma %': _percent(along, outliers),
+        'inliers': others, 'moved to another surface %': _percent(moved, others),
+        'start, ns a ray': 1e9 * (seconds['robust'] - seconds['observed']) / sum(
+            len(keyframe.rays.pixels) for keyframe in reconstruction.keyframes)}
 
 
 def tsdf_mesh(views: Sequence[View], settings: Settings) -> tsdf.Mesh:
@@ -285,6 +295,11 @@ def main() -> None:
                     accuracy(name, f'{density}, best', best(whole, score), truth)]
                 if density == 'exact':
                     continue
+                one = reconstruction.fused_mesh()
+                whole = Geometry(one.vertices, one.faces)
+                ours += [
+                    accuracy(name, 'fused', whole, truth),
+                    accuracy(name, 'fused, best', best(whole, one.vertex_confidence), truth)]
                 row, tenth = confidence(
                     name, 'robust', Found(reconstruction, truth), regime, settings.min_confidence)
                 scores.append(row)

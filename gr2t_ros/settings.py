@@ -78,9 +78,9 @@ class Settings:
     ray_stride: int = _parameter(
         1, 'March every n-th pixel of every n-th row.', unit='px', low=1, high=64)
     min_confidence: float = _parameter(
-        0.19, 'Vertices of less confidence are removed: 1 / (1 + sigma / h3), where sigma is the '
-        'standard deviation along the ray. 0.19 removes what no neighbour and no other view '
-        'supports.', low=0.0, high=1.0, live=True)
+        0.08, 'Vertices of less confidence are removed: 1 / (1 + sigma / h3), where sigma is the '
+        'standard deviation along the ray. What no neighbour and no other view supports has 0.',
+        low=0.0, high=1.0, live=True)
     min_edge_likelihood: float = _parameter(
         0.5, 'Edges whose middle has less than this fraction of the larger of their two '
         'vertices\' likelihoods are removed, and those far steeper than the edges around them; '

@@ -77,7 +77,7 @@ def test_a_lone_pixel_has_no_confidence(kind):
     confidence = confidences(sigma, np.full(len(sigma), H3))
     alone = np.isin(rays.pixels[which], [v * WIDTH + u for v, u in places])
     assert alone.sum() == 3
-    assert (confidence[alone] < 0.19).all()
+    assert (confidence[alone] < 0.08).all()
     assert (confidence[~alone] > 0.5).all()
 
 

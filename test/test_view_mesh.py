@@ -26,7 +26,7 @@ def mesh_of(depth, stride=1, T=None, others=(), **thresholds):
     rays = rays_of(density, view, 1, 'robust')
     march(density, rays, np.arange(len(rays.pixels)))
     return density, view_mesh(
-        density, rays, WIDTH, stride, thresholds.get('vertex', 0.19), thresholds.get('edge', 0.5))
+        density, rays, WIDTH, stride, thresholds.get('vertex', 0.08), thresholds.get('edge', 0.5))
 
 
 def test_a_whole_grid_has_all_its_edges_once_and_two_faces_a_square():
