@@ -45,37 +45,50 @@ class LiveCamera:
         self._source, self._parent = source, parent
         self._frame, self._child = frame, child or frame
         node = observer.node
-        self._info = node.create_publisher(CameraInfo, f'{prefix}/depth/camera_info', profile)
-        self._images = node.create_publisher(
+        self.infos = node.create_publisher(CameraInfo, f'{prefix}/depth/camera_info', profile)
+        self.images = node.create_publisher(
             CompressedImage if compressed else Image,
             f'{prefix}/depth/image' + ('/compressedDepth' if compressed else ''), profile)
-        self._poses = None
+        self.poses = None
         if source == 'tf':
-            self._poses = node.create_publisher(TFMessage, '/tf', RELIABLE)
+            self.poses = node.create_publisher(TFMessage, '/tf', RELIABLE)
         elif source:
-            self._poses = node.create_publisher(POSES[source], f'{prefix}/pose', profile)
+            self.poses = node.create_publisher(POSES[source], f'{prefix}/pose', profile)
 
     @property
     def heard(self) -> bool:
         """Return whether someone subscribes to all of it, reliably where it is offered so."""
-        publishers = [item for item in (self._info, self._images, self._poses) if item]
+        publishers = [item for item in (self.infos, self.images, self.poses) if item]
         return all(item.get_subscription_count() for item in publishers)
 
-    def publish(self, view: View, T_camera_child: Any = np.eye(4)) -> None:  # noqa: B008
-        """Publish a view's pose, camera_info and image."""
-        if self._poses:
-            self._poses.publish(pose_message(
+    def publish(
+        self, view: View, T_camera_child: Any = np.eye(4), frame: str | None = None,  # noqa: B008
+    ) -> None:
+        """Publish a view's pose, camera_info and image; frame: another one, of the image."""
+        self.publish_pose(view, T_camera_child)
+        self.infos.publish(self.info_message(view))
+        message = self.image_message(view)
+        if frame is not None:
+            message.header.frame_id = frame
+        self.images.publish(message)
+
+    def publish_pose(self, view: View, T_camera_child: Any = np.eye(4)) -> None:  # noqa: B008
+        """Publish a view's pose."""
+        if self.poses:
+            self.poses.publish(pose_message(
                 self._source, self._parent, self._child, view.stamp_ns,
                 view.T_world_camera @ T_camera_child))
+
+    def info_message(self, view: View) -> CameraInfo:
+        """Return a view's camera_info."""
         camera = view.camera
         info = CameraInfo(
             height=camera.height, width=camera.width,
             k=[camera.fx, 0.0, camera.cx, 0.0, camera.fy, camera.cy, 0.0, 0.0, 1.0])
-        stamped(info, self._frame, view.stamp_ns)
-        self._info.publish(info)
-        self._images.publish(self._image(view))
+        return stamped(info, self._frame, view.stamp_ns)
 
-    def _image(self, view: View) -> Any:
+    def image_message(self, view: View) -> Any:
+        """Return a view's image."""
         depth = view.depth
         if self._encoding != '32FC1':
             depth = np.round(1000 * np.nan_to_num(depth)).astype('<u2')

@@ -3,6 +3,8 @@
 """Images find their camera and their pose, or are counted with a sentence that helps."""
 from __future__ import annotations
 
+import struct
+
 import cv2
 from messages_for_tests import camera_info, compressed, image, pose_message, tf, transform
 import numpy as np
@@ -11,6 +13,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from gr2t_ros.core.poses import inverse
+from gr2t_ros.io import frames as frames_module
+from gr2t_ros.io import messages
 from gr2t_ros.io.frames import FrameAssembler
 from gr2t_ros.settings import Settings
 
@@ -475,6 +479,48 @@ class TestDepth:
         assert len(settled(frames)) == 1
         assert frames.dropped == {'encoding': 2, 'image_size': 1}
         assert "'rgb8'" in frames.explanations['encoding']
+
+    def test_an_image_that_comes_twice_is_used_once(self):
+        frames = self.one(DEPTH)
+        move(frames, 100 * MS)
+        for stamp_ns in (50 * MS, 40 * MS, 50 * MS, 40 * MS):
+            frames.on_depth(depth(stamp_ns))
+        assert [view.stamp_ns for view in frames.ready()] == [0, 50 * MS, 40 * MS]
+        assert frames.dropped == {'duplicate': 2}
+        assert 'came a second time' in frames.explanations['duplicate']
+
+    def test_a_loop_is_no_duplicate(self):
+        frames = assembler()
+        move(frames, 0, 500 * MS)
+        for stamp_ns in (0, 200 * MS, 400 * MS, 0, 200 * MS, 400 * MS):
+            frames.on_depth(depth(stamp_ns))
+        assert len(settled(frames)) == 6
+
+    @pytest.mark.parametrize('stamp_ns', [-1, -(1 << 31) * S, (1 << 31) * S])
+    def test_stamps_that_no_clock_has(self, stamp_ns):
+        frames = assembler()
+        move(frames, 0)
+        frames.on_depth(depth(stamp_ns))
+        assert 'writes wrong headers' in lost(frames, 'bad_stamp')
+
+    def test_large_images_of_another_size_are_not_even_decoded(self, monkeypatch):
+        monkeypatch.setattr(messages, 'depth', None)
+        frames = assembler()
+        frames.on_depth(depth(0, height=5000, width=5000, step=10000))
+        header = struct.pack('>8s I4s IIBBBBB', b'\x89PNG\r\n\x1a\n', 13, b'IHDR', 5000, 5000,
+                             16, 0, 0, 0, 0)
+        frames.on_depth(compressed('16UC1; compressedDepth png', bytes(12) + header))
+        frames.on_depth(compressed(
+            '16UC1; compressedDepth rvl', bytes(12) + struct.pack('<II', 5000, 5000)))
+        assert '5000x5000 pixels, but its camera_info is for 8x6' in lost(
+            frames, 'image_size', 3)
+
+    def test_of_huge_images_fewer_wait(self, monkeypatch):
+        monkeypatch.setattr(frames_module, '_MAX_BYTES', 3 * DEPTH.size * 4)
+        frames = assembler(max_waiting=10)
+        for i in range(5):
+            frames.on_depth(depth(i * 10 * MS))
+        assert frames.waiting == 3
 
     def test_compressed_images(self):
         frames = assembler()

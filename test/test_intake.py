@@ -5,6 +5,7 @@ from messages_for_tests import camera_info, image, tf, transform
 import numpy as np
 import pytest
 
+from gr2t_ros.io.messages import MAX_BYTES
 from gr2t_ros.ros.intake import Intake
 from gr2t_ros.ros.timings import Timings
 from gr2t_ros.settings import Settings
@@ -69,3 +70,15 @@ def test_a_jump_of_the_world_is_said_once_and_drops_nothing() -> None:
     line, = said
     assert line.startswith('frame odom jumped') and line.endswith('[world_jump: said once]')
     assert not intake.cameras[''].dropped
+
+
+def test_an_image_that_is_too_large_is_not_queued() -> None:
+    intake = intake_of()
+    intake.on_depth(image(DEPTH, data=np.zeros(MAX_BYTES + 1, np.uint8)))
+    intake.on_mask(image(DEPTH, data=np.zeros(MAX_BYTES + 1, np.uint8)))
+    assert intake.queued == 0
+    assert intake.cameras[''].dropped == {'image_size': 1}
+    image_line, mask_line = intake.news()
+    assert image_line.endswith(
+        'MB of data; up to 168 are taken [image_size: said once, then counted]')
+    assert mask_line.endswith('[mask: said once]')

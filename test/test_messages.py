@@ -299,6 +299,7 @@ class TestPose:
         ({'qw': 0.5}, 'quaternion of length 0.5, not 1'),
         ({'qx': np.nan}, 'not finite'),
         ({'px': np.nan}, 'not finite'),
+        ({'px': 1e300}, 'a position 1e.300 m away'),
         ({'pz': np.inf}, 'not finite'),
         ({'qw': np.inf}, 'not finite'),
         ({'qw': 1e200}, 'quaternion of length 1e.200, not 1'),

@@ -26,6 +26,7 @@ _STILL = 1e-3
 MAX_DISORDER_NS = 2_000_000_000
 HISTORY = 30.0  # seconds
 MAX_SAMPLES = 100_000  # of one transform; 25 MB
+_MAX_FRAMES = 10_000  # of a tree: a publisher that names each anew must not fill the memory
 _NAMES_SHOWN = 12
 
 
@@ -260,6 +261,10 @@ class TransformTree:
             raise TransformError(
                 'bad_transform', f'a transform from frame {child!r} to frame {parent!r} is left '
                 'out: both need a name')
+        if child not in self._links and len(self._links) >= _MAX_FRAMES:
+            raise TransformError(
+                'bad_transform', f'the transform from {child} to {parent} is left out: there are '
+                f'{_MAX_FRAMES} others; a publisher names its frames anew each time')
         chain = self._chain(parent)
         if child in chain:
             loop = ' -> '.join([child, *chain[:chain.index(child) + 1]])

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..core.camera import Camera
-from ..core.poses import listed, MAX_DISORDER_NS, NotYet, plain, seconds
+from ..core.poses import listed, MAX_DISORDER_NS, NotYet, seconds
 from ..core.view import View
 from ..errors import FrameError
 from ..settings import Settings
@@ -20,6 +20,10 @@ from .camera_poses import CameraPoses
 from .world import World
 
 _MAX_CAMERAS = 16  # frames of which a camera_info is kept
+_TWICE_NS = 250_000_000  # between the stamps of images when one comes twice; more is a loop
+_MAX_BYTES = 1 << 29  # of the images that wait
+_LARGE = 1 << 22  # pixels; smaller images may come a moment before their camera_info
+_MAX_STAMP_NS = (1 << 31) * 1_000_000_000  # what ROS's messages can say
 # Medians beyond these are no scene, but millimetres taken for metres or the reverse.
 _TOO_FAR, _TOO_NEAR = 100.0, 0.01  # metres
 
@@ -43,7 +47,7 @@ class FrameAssembler:
     Its camera is the latest camera_info of its frame and size, its pose that of its frame in the
     world at its stamp (see CameraPoses). The past of poses reaches back far enough for images to
     come late; should their time jump back, see PoseBuffer. Not safe for use by several threads at
-    once.
+    once. An image that comes twice, with one stamp, is used once.
 
     read: images read so far. dropped: images that gave no view, by reason. explanations: for each
     reason, and for poses that were left out, the sentence of the first case. world: where the
@@ -81,6 +85,7 @@ class FrameAssembler:
         self._masks: dict[int, NDArray[np.bool_]] = {}  # by stamp
         self._newest_ns = 0  # of the views, by the images' clock
         self._older = False  # whether the last image was of another time
+        self._seen: set[tuple[str, int]] = set()  # frames and stamps of the last images
         self._images: deque[_Image] = deque()
         self._views: list[View] = []
 
@@ -99,7 +104,7 @@ class FrameAssembler:
 
         :param msg: sensor_msgs/CameraInfo
         """
-        frame = self._camera_frame = plain(msg.header.frame_id)
+        frame = self._camera_frame = messages.frame_name(msg.header.frame_id)
         self._bad_cameras.pop(frame, None)
         known = self._cameras.pop(frame, [])
         try:
@@ -150,20 +155,42 @@ class FrameAssembler:
         """
         self.read += 1
         self._now_ns = received_ns or 0
+        frame, stamp_ns = messages.frame_name(msg.header.frame_id), messages.stamp_ns(msg.header)
         try:
+            self._check_stamp(frame, stamp_ns)
+            self._check_size(frame, *messages.size(msg))
             depth = self._in_range(messages.depth(msg))
-        except FrameError as error:
-            self._drop(error)
-            return
-        frame, stamp_ns = plain(msg.header.frame_id), messages.stamp_ns(msg.header)
-        try:
             self._watch_clock(stamp_ns)
         except FrameError as error:
             self._drop(error)
             return
+        self._remember(frame, stamp_ns)
         self._images.append(_Image(depth, frame, stamp_ns, received_ns))
-        if len(self._images) > self._max_waiting:
-            self._sort(room=self._max_waiting)
+        if len(self._images) > self._room:
+            self._sort(self._room)
+
+    @property
+    def _room(self) -> int:
+        """Return how many images may wait: of huge ones fewer."""
+        largest = max((image.depth.nbytes for image in self._images), default=1)
+        return min(self._max_waiting, max(1, _MAX_BYTES // largest))
+
+    def _check_stamp(self, frame: str, stamp_ns: int) -> None:
+        if not 0 <= min(stamp_ns, stamp_ns + self._offset_ns) < _MAX_STAMP_NS:
+            raise FrameError(
+                'bad_stamp', f'an image has the stamp {seconds(stamp_ns)}, which no clock has: '
+                'its driver writes wrong headers')
+        if any(stamp_ns < seen_ns - _TWICE_NS for _, seen_ns in self._seen):
+            self._seen.clear()
+        if (frame, stamp_ns) in self._seen:
+            raise FrameError(
+                'duplicate', f'an image of {seconds(stamp_ns)} came a second time: it is used '
+                'once; does the topic have two publishers, or the recording a part twice?')
+
+    def _remember(self, frame: str, stamp_ns: int) -> None:
+        self._seen = {item for item in self._seen if item[1] > stamp_ns - _TWICE_NS}
+        if stamp_ns:  # 0: of a driver that writes none
+            self._seen.add((frame, stamp_ns))
 
     def is_of_another_time(self, now_ns: int) -> bool:
         """Tell whether images were taken well after a stamp, so that the clock went back to it."""
@@ -184,6 +211,7 @@ class FrameAssembler:
             else:
                 self._images.append(image)
         self._poses.forget(now_ns)
+        self._seen.clear()
         self._masks = {stamp: mask for stamp, mask in self._masks.items() if not stamp}
         self._newest_ns, self._older = 0, False
 
@@ -208,13 +236,13 @@ class FrameAssembler:
         :param now_ns: by the clock of on_depth's received_ns; None: when the last image came
         """
         self._now_ns = now_ns or self._now_ns
-        self._sort(room=self._max_waiting)
+        self._sort(self._room)
         views, self._views = self._views, []
         return views
 
     def flush(self) -> list[View]:
         """Return as `ready` does, and give up on the images that still wait."""
-        self._sort(room=0)
+        self._sort(0)
         return self.ready()
 
     def _sort(self, room: int) -> None:
@@ -287,15 +315,27 @@ class FrameAssembler:
             ) if self._cameras else (
                 'no camera_info has been received: choose its topic, or start its publisher'))
         known = self._cameras[frame]
-        height, width = image.depth.shape
+        fitting = self._fitting(known, *image.depth.shape)
+        since = [camera for since_ns, camera in fitting if since_ns <= image.stamp_ns]
+        return since[-1] if since else fitting[0][1]
+
+    def _check_size(self, frame: str, height: int, width: int) -> None:
+        """Refuse a large image of another size than its camera before it costs memory."""
+        frame = frame or self._camera_frame
+        known = self._cameras.get(frame) or self._cameras.get('')
+        if known and height * width > _LARGE:
+            self._fitting(known, height, width)
+
+    def _fitting(
+        self, known: list[tuple[int, Camera]], height: int, width: int
+    ) -> list[tuple[int, Camera]]:
         fitting = [item for item in known if (item[1].height, item[1].width) == (height, width)]
         if not fitting:
             camera = known[-1][1]
             raise FrameError(
                 'image_size', f'depth image is {width}x{height} pixels, but its camera_info is '
                 f'for {camera.width}x{camera.height}: choose the camera_info of these images')
-        since = [camera for since_ns, camera in fitting if since_ns <= image.stamp_ns]
-        return since[-1] if since else fitting[0][1]
+        return fitting
 
     def _in_range(self, depth: NDArray[np.float32]) -> NDArray[np.float32]:
         """Make depths outside depth_min and depth_max invalid, in place."""

@@ -23,11 +23,15 @@ from ..core.poses import plain, Pose, seconds
 from ..errors import FrameError
 
 MAX_PIXELS = 1 << 25  # of an image; 134 MB as float32, four times the largest depth camera
+MAX_BYTES = 5 * MAX_PIXELS  # of an image's message, padding and all
 _TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 _KNOWN = '16UC1 and mono16 (millimetres), 32FC1 (metres)'
 _NO_RETURN = 65535  # with 0: how drivers write "no depth" in whole millimetres
 # hand-written quaternions have two decimals, and many nodes compute in single precision
 _MAX_QUATERNION_ERROR = 0.01
+_MAX_DISTANCE = 1e9  # m; farther than the Moon
+_MAX_COEFFICIENTS = 100  # of a distortion; OpenCV's models have 14 at most
+_MAX_NAME = 256  # characters of a frame's name that count
 
 _CONFIG = struct.Struct('<iff')  # compressedDepth: format, depth quantisation A and B
 _PNG = b'\x89PNG\r\n\x1a\n'
@@ -60,14 +64,51 @@ def stamp_ns(header: Any) -> int:
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
+def frame_name(text: str) -> str:
+    """Return a frame's name, without leading slash, and not endless."""
+    return plain(text[:_MAX_NAME])
+
+
+def check_size(msg: Any) -> None:
+    """
+    Refuse an image that is too large to be decoded, or to be kept until it is.
+
+    :param msg: sensor_msgs/Image or CompressedImage
+    :raises FrameError: if its data are larger than any depth image's
+    """
+    if len(msg.data) > MAX_BYTES:
+        raise FrameError(
+            'image_size', f'an image has {len(msg.data) / 1e6:.0f} MB of data; up to '
+            f'{MAX_BYTES / 1e6:.0f} are taken')
+
+
+def size(msg: Any) -> tuple[int, int]:
+    """
+    Return a depth image's height and width, pixels, as its header says; (0, 0): it cannot tell.
+
+    :param msg: as for depth
+    """
+    if not hasattr(msg, 'format'):
+        return int(msg.height), int(msg.width)
+    head = bytes(msg.data[_CONFIG.size:_CONFIG.size + len(_PNG) + _PNG_HEADER.size])
+    if 'rvl' in str(msg.format)[:60]:
+        width, height = _RVL_SIZE.unpack_from(head) if len(head) >= _RVL_SIZE.size else (0, 0)
+    elif head.startswith(_PNG) and len(head) == len(_PNG) + _PNG_HEADER.size:
+        width, height, _, _ = _PNG_HEADER.unpack_from(head, len(_PNG))
+    else:
+        width = height = 0
+    return height, width
+
+
 def depth(msg: Any) -> NDArray[np.float32]:
     """
     Read a depth image.
 
     :param msg: sensor_msgs/Image, or sensor_msgs/CompressedImage of compressedDepth
     :return: (h, w) float32, metres, NaN where invalid
-    :raises FrameError: see depth_image, compressed_depth
+    :raises FrameError: see check_size, depth_image, compressed_depth
     """
+    check_size(msg)
     return compressed_depth(msg) if hasattr(msg, 'format') else depth_image(msg)
 
 
@@ -133,13 +174,15 @@ def mask(msg: Any) -> NDArray[np.bool_]:
 
     :param msg: sensor_msgs/Image of mono8 or 8UC1
     :return: (h, w) bool, true where a pixel is to be ignored: where it is not 0
-    :raises FrameError: if it has another encoding, or was cut off
+    :raises FrameError: if it has another encoding, is too large or was cut off
     """
+    check_size(msg)
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
     if msg.encoding not in ('mono8', '8UC1'):
         raise FrameError(
             'mask', f'the mask has encoding {str(msg.encoding)[:40]!r}; mono8 and 8UC1 are known')
-    if not height or step < width or len(msg.data) < step * (height - 1) + width:
+    if not 0 < height * width <= MAX_PIXELS or step < width or (
+            len(msg.data) < step * (height - 1) + width):
         raise FrameError('mask', f'the mask of {width}x{height} pixels with step {step} has '
                          f'{len(msg.data)} bytes of data: its publisher writes wrong headers')
     raw = np.ndarray((height, width), np.uint8, msg.data, strides=(step, 1))
@@ -157,6 +200,10 @@ def camera(msg: Any, *, rectified: bool) -> Camera:
     """
     # ROS 1 has these names in capitals
     K, D, P = (getattr(msg, name if hasattr(msg, name) else name.upper()) for name in 'kdp')
+    if len(D) > _MAX_COEFFICIENTS:
+        raise FrameError(
+            'distortion_model', f'camera_info has {len(D)} distortion coefficients; no model has '
+            'so many: its publisher writes wrong messages')
     roi = msg.roi
     return Camera.from_camera_info(
         int(msg.width), int(msg.height), K, D, P, str(msg.distortion_model), rectified=rectified,
@@ -170,7 +217,8 @@ def pose(msg: Any, kind: str) -> StampedPose:
 
     :param msg: the message that `kind` names
     :param kind: pose, pose_with_covariance, odometry or transform, as Settings.pose_source
-    :raises FrameError: if its numbers are not finite, or its quaternion is far from length 1
+    :raises FrameError: if its numbers are not finite or absurd, or its quaternion is far from
+        length 1
     """
     header = msg.header
     if kind == 'transform':
@@ -178,13 +226,17 @@ def pose(msg: Any, kind: str) -> StampedPose:
     else:
         inner = msg.pose if kind == 'pose' else msg.pose.pose
         position, rotation = inner.position, inner.orientation
-    parent, child = plain(header.frame_id), plain(getattr(msg, 'child_frame_id', ''))
+    parent = frame_name(header.frame_id)
+    child = frame_name(getattr(msg, 'child_frame_id', ''))
     stamp = stamp_ns(header)
     numbers = (position.x, position.y, position.z, rotation.x, rotation.y, rotation.z, rotation.w)
     norm = hypot(*numbers[3:])
-    if not (abs(norm - 1) <= _MAX_QUATERNION_ERROR and all(map(isfinite, numbers))):
-        what = (f'has a quaternion of length {norm:.3g}, not 1' if all(map(isfinite, numbers))
-                else 'has numbers that are not finite')
+    away = max(map(abs, numbers[:3]))
+    if not (abs(norm - 1) <= _MAX_QUATERNION_ERROR and all(map(isfinite, numbers))
+            and away <= _MAX_DISTANCE):
+        what = 'has numbers that are not finite' if not all(map(isfinite, numbers)) else (
+            f'has a position {away:.3g} m away' if away > _MAX_DISTANCE
+            else f'has a quaternion of length {norm:.3g}, not 1')
         raise FrameError(
             'bad_pose', f'the pose of {child or "the camera"} in {parent!r} at {seconds(stamp)} '
             f'{what}: images at that time are left out')
@@ -215,7 +267,7 @@ def unknown_pose(msg: Any) -> StampedPose:
     :param msg: any message that `pose` takes
     """
     return StampedPose(
-        plain(msg.header.frame_id), plain(getattr(msg, 'child_frame_id', '')),
+        frame_name(msg.header.frame_id), frame_name(getattr(msg, 'child_frame_id', '')),
         stamp_ns(msg.header), np.full((4, 4), np.nan))
 
 

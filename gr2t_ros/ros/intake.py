@@ -11,6 +11,8 @@ import time
 from typing import Any
 
 from ..core.view import View
+from ..errors import FrameError
+from ..io import messages
 from ..io.frames import FrameAssembler
 from ..io.world import World
 from ..settings import Settings
@@ -28,7 +30,8 @@ class CameraIntake:
     One camera's images; the numbers may be read by any thread.
 
     received: images that came. integrated: those in the map. queued: those that wait for the
-    worker. lost: those that were dropped before or after the assembler, by reason.
+    worker. lost: those that were dropped before or after the assembler, by reason. refused:
+    sentences on those that were too large to be queued.
     """
 
     assembler: FrameAssembler
@@ -36,6 +39,7 @@ class CameraIntake:
     integrated: int = 0
     queued: int = 0
     lost: Counter[str] = field(default_factory=Counter)
+    refused: dict[str, str] = field(default_factory=dict)
 
     @property
     def dropped(self) -> Counter[str]:
@@ -45,7 +49,7 @@ class CameraIntake:
     @property
     def explanations(self) -> dict[str, str]:
         """Return a sentence for each reason for which something was left out."""
-        explanations = dict(self.assembler.explanations)
+        explanations = {**self.refused, **self.assembler.explanations}
         if self.lost['queue_full']:
             explanations['queue_full'] = _QUEUE_FULL
         return explanations
@@ -99,6 +103,13 @@ class Intake:
         into = self.cameras[camera]
         with self._lock:
             into.received += 1
+            try:
+                messages.check_size(message)
+            except FrameError as error:
+                into.lost[error.reason] += 1
+                into.refused.setdefault(error.reason, str(error))
+                self._notify()
+                return
             if self._paused:
                 into.lost['paused'] += 1
                 return
@@ -127,6 +138,11 @@ class Intake:
     def on_mask(self, message: Any, camera: str = '') -> None:
         """Enqueue a mask."""
         assembler = self.cameras[camera].assembler
+        try:
+            messages.check_size(message)
+        except FrameError as error:
+            self.cameras[camera].refused.setdefault('mask', str(error))
+            return
         self._enqueue(lambda: assembler.on_mask(message))
 
     def on_clock_jump(self, now_ns: int) -> None:
