@@ -5,11 +5,12 @@
 # make paper     the paper's experiment again, beside Open3D; docs/results.md explains it
 # make soak      20 minutes of images into the node: memory, the cost of a frame, leaks
 # make chaos     faults around a running node, and what is lost by them; kill -9 while it writes
+# make fuzz      what reads other people's bytes, by damaged ones: a minute for each decoder
 # make venv      only what these begin with: the environment they run in
 #
 # Options: DISTRO=jazzy (wheels; default kilted), PYTHON=python3.12, ARGS='-k camera' for pytest,
-# ARGS=--quick for the benchmark or '--minutes 2' for the soak, MESH=bunny.ply for the paper,
-# EXTRAS. Where ROS 2 is sourced it is used, and DISTRO has no effect.
+# ARGS=--quick for the benchmark, '--minutes 2' for the soak or '--seconds 300' for fuzz,
+# MESH=bunny.ply for the paper, EXTRAS. Where ROS 2 is sourced it is used, and DISTRO has no effect.
 
 PYTHON =
 DISTRO = kilted
@@ -22,7 +23,7 @@ RUN = $(VENV)/bin/python
 OTHER_HINTS = [ -n "$(ROS_DISTRO)" ] || \
     ! $(RUN) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))'
 
-.PHONY: venv demo test test-ros bench paper soak chaos clean
+.PHONY: venv demo test test-ros bench paper soak chaos fuzz clean
 
 venv:
 	@$(or $(PYTHON),python3) scripts/setup_venv.py --venv $(VENV) --distro $(DISTRO) \
@@ -52,6 +53,10 @@ chaos: venv
 
 paper: venv
 	$(RUN) benchmarks/paper.py $(MESH) $(ARGS)
+
+fuzz: EXTRAS = dev,fuzz
+fuzz: venv
+	$(RUN) test/fuzz.py $(ARGS)
 
 clean:
 	rm -rf .venv .venv-jazzy build install log gr2t_ros.egg-info

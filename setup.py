@@ -65,6 +65,8 @@ setup(
             'ruff>=0.6',
             'types-PyYAML',
         ],
+        # Its wheels are for Linux, from Python 3.10 on.
+        'fuzz': ['atheris>=2.3'],
         # Other people's readers of our PLY files; large.
         'peers': ['open3d>=0.18', 'pymeshlab>=2023.12'],
     },

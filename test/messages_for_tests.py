@@ -9,12 +9,12 @@ import numpy as np
 from rosbags.typesys import get_typestore, Stores
 from scipy.spatial.transform import Rotation
 
-_TYPES = get_typestore(Stores.ROS2_HUMBLE).types
+TYPES = get_typestore(Stores.ROS2_HUMBLE)
 
 
 def make(name: str, **fields: Any) -> Any:
     """Return a message, by the last part of its type's name."""
-    return next(kind for key, kind in _TYPES.items() if key.endswith(f'/{name}'))(**fields)
+    return next(kind for key, kind in TYPES.types.items() if key.endswith(f'/{name}'))(**fields)
 
 
 def header(stamp_ns: int = 0, frame: str = 'camera') -> Any:

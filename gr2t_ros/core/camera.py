@@ -32,8 +32,8 @@ class Camera:
     :param fx: focal lengths and principal point, pixels
     :param model: one of MODELS, as sensor_msgs/CameraInfo names them
     :param distortion: its coefficients in ROS's (OpenCV's) order; empty: no distortion
-    :raises FrameError: if the focal length is not positive or far too short for the size, or the
-        distortion is unknown
+    :raises FrameError: if a size or focal length is not positive, that far too short for the size,
+        or the distortion unknown
     """
 
     width: int
@@ -46,6 +46,10 @@ class Camera:
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.width <= 0 or self.height <= 0:
+            raise FrameError(
+                'uncalibrated', f'camera_info is for images of {self.width}x{self.height} pixels: '
+                'publish one with the size of the images')
         numbers = (self.fx, self.fy, self.cx, self.cy, *self.distortion)
         if not (self.fx > 0 and self.fy > 0 and np.isfinite(numbers).all()):
             raise FrameError(

@@ -61,6 +61,8 @@ def read(path: Path) -> Mesh:
             f'{path} cannot be read as a mesh ({type(error).__name__}: {error})') from error
     if not isinstance(found, trimesh.Trimesh) or len(found.faces) == 0:
         raise InputError(f'{path} has no triangles')
+    if found.faces.min() < 0 or found.faces.max() >= len(found.vertices):
+        raise InputError(f'{path} has triangles of vertices that it does not hold')
     if not np.isfinite(found.vertices).all():
         raise InputError(f'{path} has vertices that are not finite')
     vertices, colours = np.array(found.vertices, np.float64), _colours(found)
