@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map that was saved and loaded goes on as if nothing had happened; a damaged one is refused."""
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import fields, replace
 import hashlib
 from itertools import islice
 import json
@@ -14,11 +14,15 @@ import numpy as np
 import pytest
 from scenes_for_tests import bumpy_views, plane_view, pose
 
+from gr2t_ros.core.blocks import Blocks
 from gr2t_ros.core.camera import Camera
+from gr2t_ros.core.exact_density import Views
 from gr2t_ros.core.frozen import room_for
-from gr2t_ros.core.reconstruction import Reconstruction
+from gr2t_ros.core.ray_march import Rays
+from gr2t_ros.core.reconstruction import Keyframe, Reconstruction
 from gr2t_ros.core.state import ADDING, columns_of, state_of
 from gr2t_ros.core.view import View
+from gr2t_ros.core.voxel_density import VoxelDensity
 from gr2t_ros.errors import FrameError, Gr2tError, InputError
 from gr2t_ros.io import topics
 from gr2t_ros.io.bags import Bag
@@ -165,6 +169,27 @@ def test_of_a_copy_while_views_come(tmp_path: Path, density: str) -> None:
     original.finish()
     save_map(tmp_path / 'map.gr2t', copy, 'map')
     assert_same_state(loaded(tmp_path / 'map.gr2t', settings), built(some[:2], settings))
+
+
+def test_nothing_is_forgotten() -> None:
+    """All that a map consists of is saved, or follows from what is; new fields belong here."""
+    assert set(Blocks._fields) == {
+        *ADDING, 'size', 'table_key', 'table_block', 'coefficient', 'neighbour'}
+    saved = columns_of('voxel')
+    assert {item.name for item in fields(Rays) if item.init} == {
+        *(name.partition('_')[2] for name in saved if name.startswith('ray_')),
+        'table', 'T_world_camera'}
+    assert {item.name for item in fields(Keyframe)} == {
+        'view', 'rays', 'blocks', 'checked', 'released', 'shared'}
+    assert {f'view_{name}' for name in Views._fields} == {
+        'view_size', *(name for name in columns_of('exact') if name.startswith('view_'))}
+    assert set(vars(VoxelDensity(1.5, 0.003, 0.002, 0.01, 5.0))) == {
+        # saved
+        'voxel_size', 'depth_max', 'blocks', 'size', 'pixels', 'aliased_pixels', '_change',
+        # from the settings
+        'pixel_bandwidth', 'bandwidth', 'scale', 'weights', '_depth_of_bins', 'most_blocks',
+        # of the moment: empty when the spline is up to date
+        '_recent', '_stale'}
 
 
 def test_other_settings(saved: Path) -> None:

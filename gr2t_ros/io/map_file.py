@@ -172,14 +172,12 @@ class MapFile:
             raise InputError('it became shorter while it was read')
         return rows
 
-    def load(self, reconstruction: Reconstruction) -> None:
+    def check(self, settings: Settings) -> None:
         """
-        Make an empty reconstruction the saved one.
+        Refuse settings with which the map cannot go on.
 
-        :param reconstruction: its settings may differ from the saved ones, but for the FIXED
-        :raises InputError: naming the settings that differ, or what is wrong with the content
+        :raises InputError: naming those that differ
         """
-        settings = reconstruction.settings
         different = differing(settings, settings.voxel_size, self.settings, self.voxel_size)
         if different:
             raise InputError(
@@ -187,6 +185,15 @@ class MapFile:
                 + ', '.join(f'{name} is {there} there and {here} here'
                             for name, here, there in different)
                 + '; set what the map was built with')
+
+    def load(self, reconstruction: Reconstruction) -> None:
+        """
+        Make an empty reconstruction the saved one.
+
+        :param reconstruction: its settings may differ from the saved ones, but for the FIXED
+        :raises InputError: see check; or if the content contradicts itself
+        """
+        self.check(reconstruction.settings)
         try:
             restore(reconstruction, self._numbers, self)
         except OSError as error:

@@ -154,6 +154,7 @@ def _settings(args: argparse.Namespace, resumed: MapFile | None) -> Settings:
         settings = settings.updated({'world_frame': args.world_frame})
     if resumed is None:
         return settings
+    resumed.check(settings)
     if settings.world_frame not in ('', resumed.world_frame):
         raise InputError(
             f'cannot go on with the map {resumed.path}: it is in the world frame '
