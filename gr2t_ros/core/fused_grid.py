@@ -3,8 +3,8 @@
 """
 The fused map's samples: distances to the maxima of all keyframes, averaged by weight.
 
-Blocks of 8 x 8 x 8 voxels as in blocks.py. Each sum over keyframes is taken anew, in their order,
-when one of them has changed there, so that a sample does not depend on how it came about.
+Blocks of 8 x 8 x 8 voxels as in blocks.py. The sums are of whole numbers: what a keyframe added
+can be subtracted again when it changes, and no sum depends on how it came about.
 """
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ Floats = NDArray[np.float32]
 BYTES_PER_BLOCK = 2 * 4 * VOXELS + 8 + 27 * 4 + 4 + 4 * 12
 _NEAR = 3.0
 _MIN_COSINE = 0.05
+# a view's weight is 1 at most, its distance some voxels: thousands of views fit into 31 bits
+WEIGHT, DISTANCE = 1 << 17, 1 << 14
 _AGREEMENT = 0xFFFF  # of the word behind a PIXEL's depth
 
 
@@ -37,16 +39,17 @@ class Grid(NamedTuple):
     """
     The samples; the names that blocks.Blocks has too mean the same.
 
-    :param weight: flat float32, VOXELS a block, x fastest: the sum of the weights
-    :param distance: likewise: the weighted sum of the distances, metres, above 0 outside
+    :param weight: flat int32, VOXELS a block, x fastest: the sum of the weights, in 1 / WEIGHT
+    :param distance: likewise: the weighted sum of the distances, in voxels / DISTANCE, above 0
+        outside
     """
 
     size: int
     table_key: NDArray[np.int64]
     table_block: NDArray[np.int32]
     key: NDArray[np.int64]
-    weight: Floats
-    distance: Floats
+    weight: NDArray[np.int32]
+    distance: NDArray[np.int32]
     neighbour: NDArray[np.int32]
     touched: NDArray[np.int32]
 
@@ -56,7 +59,7 @@ def new_grid(capacity: int = 1024) -> Grid:
     table = 1 << (4 * capacity - 1).bit_length()
     return Grid(
         1, np.zeros(table, np.int64), np.zeros(table, np.int32), np.full(capacity, -1, np.int64),
-        np.zeros(capacity * VOXELS, np.float32), np.zeros(capacity * VOXELS, np.float32),
+        np.zeros(capacity * VOXELS, np.int32), np.zeros(capacity * VOXELS, np.int32),
         np.zeros((capacity, 27), np.int32), np.zeros(capacity, np.int32))
 
 
@@ -271,43 +274,39 @@ def find_corners(
 
 
 @njit(cache=True, nogil=True)
-def sum_blocks(
+def add_view(
     grid: Grid, chosen: NDArray[np.int32], views: Views, bandwidth: Bandwidth, sigma: Bandwidth,
-    voxel: float,
+    voxel: float, view: int, sign: int,
 ) -> None:
-    """Sum what all views say of the voxels of some blocks."""
-    _sum_blocks(grid, chosen, views, bandwidth, sigma, voxel, np.zeros((27, 4)))
+    """Add what a view says of the voxels of some blocks, or subtract it (sign -1)."""
+    _add_view(grid, chosen, views, bandwidth, sigma, voxel, view, sign, np.zeros((27, 4)))
 
 
 @uncounted(error_model='numpy')
-def _sum_blocks(
+def _add_view(
     grid: Grid, chosen: NDArray[np.int32], views: Views, bandwidth: Bandwidth, sigma: Bandwidth,
-    voxel: float, corners: Doubles,
+    voxel: float, view: int, sign: int, corners: Doubles,
 ) -> None:
     for block in chosen:
-        first = int64(block) * VOXELS
-        for n in range(VOXELS):
-            grid.weight[first + n] = 0
-            grid.distance[first + n] = 0
         i, j, k = place_of(grid.key[block])
         x, y, z = i * SIDE * voxel, j * SIDE * voxel, k * SIDE * voxel
-        for view in range(len(views.stride)):
-            find_corners(views, view, x, y, z, SIDE * voxel, corners)
-            if not sees(views, view, sigma, corners, 0, 2):
-                continue
-            for part in range(8):
-                if sees(views, view, sigma, corners, _corner_of(part), 1):
-                    _add(grid, first, part, views, view, x, y, z, bandwidth, sigma, voxel)
+        find_corners(views, view, x, y, z, SIDE * voxel, corners)
+        for part in range(8):
+            if sees(views, view, sigma, corners, _corner_of(part), 1):
+                _add(
+                    grid, int64(block) * VOXELS, part, views, view, x, y, z, bandwidth, sigma,
+                    voxel, sign)
 
 
 @uncounted(error_model='numpy')
 def _add(
     grid: Grid, first: int, part: int, views: Views, view: int, x: float, y: float, z: float,
-    bandwidth: Bandwidth, sigma: Bandwidth, voxel: float,
+    bandwidth: Bandwidth, sigma: Bandwidth, voxel: float, sign: int,
 ) -> None:
     """Add a view to one of the 8 parts of a block, whose first voxel is at (x, y, z), metres."""
     T = views.T_camera_world[view]
     pixels, height, width = views.address[view, 0], views.size[view, 0], views.size[view, 1]
+    per_voxel = DISTANCE / voxel
     distorted = views.camera[view, 0] != 0.0
     fx, fy, cx, cy = (
         views.pinhole[view, 0], views.pinhole[view, 1], views.pinhole[view, 2],
@@ -330,8 +329,9 @@ def _add(
             weight, distance, _, _, _ = said(
                 pixels, height, width, bandwidth, sigma, u, v, at_x, at_y, at_z)
             if weight > 0:
-                grid.weight[to + i] += weight
-                grid.distance[to + i] += weight * distance
+                grid.weight[to + i] += sign * int(weight * WEIGHT + 0.5)
+                grid.distance[to + i] += sign * int(np.floor(
+                    weight * distance * per_voxel + 0.5))
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,7 @@ how much they face their camera; the mesh is where the average is zero.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -21,11 +21,11 @@ from ..settings import Settings
 from .blocks import key_of, place_of, places_of, with_keys
 from .compiled import run_all
 from .fused_grid import (
+    add_view,
     BYTES_PER_BLOCK,
     Grid,
     new_grid,
     reached,
-    sum_blocks,
     Views,
     views_of,
     without_empty,
@@ -39,10 +39,11 @@ from .voxel_density import VoxelDensity
 
 Doubles = NDArray[np.float64]
 Region = tuple[int, int, int]
+Seen = tuple[Views, Bandwidth, Bandwidth, float]
 
 REGION = 8  # blocks; side of a region
 MIN_COMPONENT = 50  # triangles
-_BLOCKS = 64  # a task
+_BLOCKS = 128  # a task
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,15 +123,11 @@ class FusedMap:
         self._images = {
             view: self._images.get(view) or FusedView(view.camera, settings.ray_stride)
             for view, _ in keyframes}
-        fresh = [(number, self._images[view], rays) for number, (view, rays)
-                 in enumerate(keyframes) if self._images[view].rounds != rays.rounds]
-        keys = run_all(pool, FusedView.update, [
-            (image, density, rays, self._min_confidence, self._voxel)
-            for _, image, rays in fresh])
-        seen = self._seen(density)
-        self._sum(seen, run_all(pool, reached, [
-            (self._grid, some, *seen, number)
-            for some, (number, _, _) in zip(keys, fresh)]), pool)
+        fresh = [item for item in keyframes if self._images[item[0]].rounds != item[1].rounds]
+        for view, rays in fresh:
+            touched = self._images[view].update(
+                density, rays, self._min_confidence, self._voxel, pool)
+            self._take_in(density, view, touched, pool)
         changed, self._changed = self._changed, []
         return _unique(np.concatenate([np.zeros((0, 3), np.int64), *changed]))
 
@@ -139,30 +136,41 @@ class FusedMap:
     ) -> None:
         """Forget all keyframes but some, and the blocks that are empty then."""
         gone = set(self._images) - set(views)
-        if not gone:
-            return
-        seen, keys = self._seen(density), self._grid.key[1:self._grid.size]
-        touched = [
-            reached(new_grid(1), keys, *seen, number)
-            for number, view in enumerate(self._images) if view in gone]
-        self._images = {
-            view: image for view, image in self._images.items() if view not in gone}
-        self._sum(self._seen(density), touched, pool)
-        self._grid = without_empty(self._grid)
+        for view in gone:
+            image = self._images.pop(view)  # the kernels know where it is, and do not keep it
+            seen = self._seen(density, {view: image})
+            blocks = np.arange(1, self._grid.size, dtype=np.int32)
+            keys = reached(new_grid(1), self._grid.key[blocks], *seen, 0)
+            self._sum(seen, self._blocks_of(keys), -1, pool)
+        if gone:
+            self._grid = without_empty(self._grid)
+
+    def _take_in(
+        self, density: Density, view: View, keys: NDArray[np.int64], pool: Executor | None
+    ) -> None:
+        """Replace what a keyframe said before in the blocks with some keys by what it says now."""
+        image = self._images[view]
+        now = self._seen(density, {view: image})
+        blocks = self._blocks_of(reached(self._grid, keys, *now, 0))
+        if image.former is not None:
+            self._sum(self._seen(density, {view: image.former}), blocks, -1, pool)
+            image.former = None
+        self._sum(now, blocks, 1, pool)
+
+    def _blocks_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
+        """Return the blocks with some keys, made where there are none; note that they change."""
+        self._change += 1
+        self._grid, blocks = with_keys(self._grid, keys, self._change, new=new_grid)
+        self._changed.append(np.unique(_regions_of(_before(self._grid, blocks)), axis=0))
+        return blocks
 
     def _sum(
-        self, seen: tuple[Views, Bandwidth, Bandwidth, float], keys: list[NDArray[np.int64]],
-        pool: Executor | None,
+        self, seen: Seen, blocks: NDArray[np.int32], sign: int, pool: Executor | None
     ) -> None:
-        """Sum the blocks with some keys anew, and note which regions that changes."""
-        if not keys:
-            return
-        self._change += 1
-        self._grid, dirty = with_keys(
-            self._grid, np.concatenate(keys), self._change, new=new_grid)
-        run_all(pool, sum_blocks, [
-            (self._grid, dirty[i:i + _BLOCKS], *seen) for i in range(0, len(dirty), _BLOCKS)])
-        self._changed.append(np.unique(_regions_of(_before(self._grid, dirty)), axis=0))
+        """Add what one keyframe says to the blocks, or subtract it."""
+        run_all(pool, add_view, [
+            (self._grid, blocks[i:i + _BLOCKS], *seen, 0, sign)
+            for i in range(0, len(blocks), _BLOCKS)])
 
     def mesh(
         self, density: Density | None, pool: Executor | None,
@@ -180,15 +188,16 @@ class FusedMap:
         if region is not None:
             blocks = blocks[(_regions_of(self._grid.key[blocks]) == region).all(axis=1)]
         found = without_islands(
-            surface(self._grid, blocks, *self._seen(density), pool), min_component)
+            surface(self._grid, blocks, *self._seen(density, self._images), pool),
+            min_component)
         return SurfaceMesh(
             found.vertices, density.likelihood(found.vertices, pool).astype(np.float32),
             found.sigma, found.confidence, found.views, found.faces)
 
-    def _seen(self, density: Density) -> tuple[Views, Bandwidth, Bandwidth, float]:
-        """Return what the kernels need of the keyframes."""
+    def _seen(self, density: Density, images: Mapping[View, FusedView]) -> Seen:
+        """Return what the kernels need of keyframes."""
         return (
-            views_of(self._images), density.bandwidth, spread(density.bandwidth, self._voxel),
+            views_of(images), density.bandwidth, spread(density.bandwidth, self._voxel),
             self._voxel)
 
 

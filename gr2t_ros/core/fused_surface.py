@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .blocks import place_of, SIDE, VOXELS
 from .compiled import run_all, uncounted
-from .fused_grid import find_corners, Grid, moved, projected, said, sees, Views
+from .fused_grid import find_corners, Grid, moved, projected, said, sees, Views, WEIGHT
 from .fused_view import Bandwidth
 from .marching_cubes import EDGE_AXIS, EDGE_CORNER, table
 
@@ -26,8 +26,9 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 
 MIN_WEIGHT = 0.03  # of a vertex; 1 is one view that faces the surface and agrees with the others
-_KNOWN = np.float32(1e-9)  # weight of a sample that is one
+_PER_WEIGHT = np.float32(1 / WEIGHT)
 _WIDE = SIDE + 1
+_END = 0.001  # of an edge
 _WORDS = 3 * VOXELS // 64
 _BLOCKS = 64  # a task
 _EDGE_CORNER, _EDGE_AXIS = EDGE_CORNER.astype(np.int64), EDGE_AXIS.astype(np.int64)
@@ -60,12 +61,14 @@ class _Edges(NamedTuple):
     :param number: (size of the grid,) int32, where a block is in block, -1 for the others
     :param words: (n, 24) uint64, a bit for each edge
     :param first: (n + 1,) int64, the number of the block's first vertex
+    :param before: (n, 24) int64, the number of each word's first vertex
     """
 
     block: Ints
     number: Ints
     words: NDArray[np.uint64]
     first: NDArray[np.int64]
+    before: NDArray[np.int64]
 
 
 def surface(
@@ -152,7 +155,22 @@ def _edges(grid: Grid, blocks: Ints, pool: Executor | None) -> _Edges:
         (grid, owners[i:i + _BLOCKS], words[i:i + _BLOCKS], first[i + 1:i + 1 + _BLOCKS],
          np.zeros(_WIDE ** 3, np.float32), np.zeros(_WIDE ** 3, np.float32))
         for i in range(0, len(owners), _BLOCKS)])
-    return _Edges(owners, number, words, np.cumsum(first))
+    first = np.cumsum(first)
+    before = np.zeros(words.shape, np.int64)
+    _count(words, first, before)
+    return _Edges(owners, number, words, first, before)
+
+
+@njit(cache=True, nogil=True)
+def _count(
+    words: NDArray[np.uint64], first: NDArray[np.int64], before: NDArray[np.int64]
+) -> None:
+    """Write the number of each word's first vertex."""
+    for owner in range(len(words)):
+        number = first[owner]
+        for n in range(_WORDS):
+            before[owner, n] = number
+            number += _ones(words[owner, n])
 
 
 @njit(cache=True, nogil=True)
@@ -193,12 +211,11 @@ def _gather(grid: Grid, block: int, value: Floats, weight: Floats) -> bool:
                 source = other * VOXELS + (k * SIDE + j) * SIDE
                 for i in range(1 if x0 else SIDE):
                     total = grid.weight[source + i]
-                    if other == 0 or total <= _KNOWN:
-                        weight[to + i] = 0
+                    weight[to + i] = total * _PER_WEIGHT
+                    if total == 0:
                         value[to + i] = 0
                         continue
-                    weight[to + i] = total
-                    value[to + i] = grid.distance[source + i] / total
+                    value[to + i] = np.float32(grid.distance[source + i]) / np.float32(total)
                     if value[to + i] < 0:
                         below += 1
                     else:
@@ -243,13 +260,12 @@ def _ones(word: np.uint64) -> np.int64:
 def _vertex_of(edges: _Edges, owner: int, edge: int) -> np.int64:
     """Return the number of an edge's vertex, -1 where there is none."""
     word, bit = edge >> 6, uint64(edge & 63)
-    if edges.words[owner, word] >> bit & uint64(1) == 0:
+    bits = edges.words[owner, word]
+    if bits >> bit & uint64(1) == 0:
         return int64(-1)
-    count = edges.first[owner]
-    for n in range(word):
-        count += _ones(edges.words[owner, n])
-    below: np.int64 = count + _ones(edges.words[owner, word] & ((uint64(1) << bit) - uint64(1)))
-    return below
+    number: np.int64 = edges.before[owner, word] + _ones(
+        bits & ((uint64(1) << bit) - uint64(1)))
+    return number
 
 
 @njit(cache=True, nogil=True)
@@ -326,7 +342,8 @@ def _place(
             vertices[vertex, 0] = (SIDE * x + i) * voxel
             vertices[vertex, 1] = (SIDE * y + j) * voxel
             vertices[vertex, 2] = (SIDE * z + k) * voxel
-            vertices[vertex, axis] += voxel * (a / (a - b))
+            # never at its end, where other edges have a vertex too
+            vertices[vertex, axis] += voxel * min(max(a / (a - b), _END), 1 - _END)
             vertex += 1
 
 

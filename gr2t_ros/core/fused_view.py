@@ -7,6 +7,8 @@ An image has a pixel for each ray that could be, one every ray_stride pixels of 
 """
 from __future__ import annotations
 
+from concurrent.futures import Executor
+from copy import copy
 from math import sqrt
 
 import cv2
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from .blocks import key_of, SIDE, with_room
 from .camera import Camera
 from .climb import h3_at
+from .compiled import run_all
 from .confidence import confidences, deviations_and_agreements
 from .ray_march import Density, Rays
 
@@ -31,12 +34,14 @@ Bandwidth = tuple[float, float, float]
 #   confidence  in steps of 1 / 255
 PIXEL = np.dtype([
     ('depth', 'f4'), ('agreement', 'u2'), ('frontality', 'u1'), ('confidence', 'u1')])
-AGREEMENT = 1 << 14
+AGREEMENT = 65535
 _MIN_AGREEMENT = 0.05  # less is what an outlier has
 JUMP = 4.0  # h3 between neighbours that lie on different surfaces
 TILE = 4  # pixels; side of the squares whose depths are known
 REACH = 4.0
-_HALO = 2  # pixels about a tile that have a part in what lies within it
+_SQUARE = 8  # pixels; side of the squares whose blocks are found together
+_HALO = 2  # pixels about a square that have a part in what lies within it
+_RAYS, _ROWS = 32768, 80  # a task; rows of whole squares and tiles
 _BITS = 64
 
 
@@ -55,7 +60,7 @@ class FusedView:
 
     `pixels` is (h, w) PIXEL; `tiles` is (h / TILE, w / TILE, 2) float32, the least and the largest
     depth in each tile, metres; (inf, -inf) where there is none; `rounds` is that of the rays when
-    they were taken in.
+    they were taken in; `former` is the image as it was before the last update, where it is kept.
     """
 
     def __init__(self, camera: Camera, stride: int) -> None:
@@ -66,6 +71,7 @@ class FusedView:
         self.pixels = np.zeros((height, width), PIXEL)
         self.tiles = np.zeros((-(-height // TILE), -(-width // TILE), 2), np.float32)
         self._marches = np.zeros(0, np.uint16)
+        self.former: FusedView | None = None
         self.depth = (np.inf, -np.inf)
         self._margin = 2.0 * stride / min(camera.fx, camera.fy)
 
@@ -85,7 +91,8 @@ class FusedView:
         self._marches[:] = 0
 
     def update(
-        self, density: Density, rays: Rays, min_confidence: float, voxel: float
+        self, density: Density, rays: Rays, min_confidence: float, voxel: float,
+        pool: Executor | None,
     ) -> NDArray[np.int64]:
         """
         Take in the rays that were marched since the last time.
@@ -98,52 +105,59 @@ class FusedView:
             self._marches = np.zeros_like(rays.marches)
         which = np.flatnonzero(self._marches != rays.marches)
         self._marches, self.rounds = rays.marches.copy(), rays.rounds
-        depth_before = np.where(self.pixels['agreement'] > 0, self.pixels['depth'], np.nan)
-        sigma, agreement = deviations_and_agreements(density, rays, which)
-        depth = rays.depth[which]
-        confidence = confidences(sigma, density.h3(depth))
-        agreement[~rays.converged[which] | (confidence < min_confidence)] = 0
+        self.former = copy(self)
+        self.pixels, self.tiles = self.pixels.copy(), self.tiles.copy()
         changed = np.zeros(self.pixels.shape, np.uint8)
-        v, u = np.divmod(rays.pixels[which], rays.table.shape[1])
-        _enter(
-            self.pixels, v // self.stride, u // self.stride, depth, agreement, confidence,
-            changed)
+
+        def enter(some: NDArray[np.int64]) -> None:
+            sigma, agreement = deviations_and_agreements(density, rays, some)
+            depth = rays.depth[some]
+            confidence = confidences(sigma, density.h3(depth))
+            agreement[~rays.converged[some] | (confidence < min_confidence)] = 0
+            _enter(
+                self.pixels, rays.pixels[some], rays.table.shape[1], self.stride, depth,
+                agreement, confidence, changed)
+
+        run_all(pool, enter, [(which[i:i + _RAYS],) for i in range(0, len(which), _RAYS)])
         about = np.asarray(cv2.dilate(changed, np.ones((3, 3), np.uint8)), np.uint8)
-        _turn(self.pixels, self._table, density.bandwidth, about)
-        _measure(self.pixels, self.tiles)
-        sigma_here = spread(density.bandwidth, voxel)
+        rows = [(v, min(v + _ROWS, len(about))) for v in range(0, len(about), _ROWS)]
+        run_all(pool, _turn, [
+            (self.pixels, self._table, density.bandwidth, about, *some) for some in rows])
+        run_all(pool, _measure, [(self.pixels, self.tiles, *some) for some in rows])
+        sigma = spread(density.bandwidth, voxel)
         near, far = float(self.tiles[..., 0].min()), float(self.tiles[..., 1].max())
-        reach = REACH * h3_at(sigma_here, far)
+        reach = REACH * h3_at(sigma, far)
         self.depth = (near - reach, far + reach)
         T = rays.T_world_camera
-        return _keys(
-            self.pixels, depth_before, about, self._table, self._margin, T[:3, :3].copy(),
-            T[:3, 3].copy(), sigma_here, SIDE * voxel)
+        return np.concatenate(run_all(pool, _keys, [
+            (self.pixels, self.former.pixels, about, self._table, self._margin, T[:3, :3].copy(),
+             T[:3, 3].copy(), sigma, SIDE * voxel, *some) for some in rows]))
 
 
 @njit(cache=True, nogil=True)
 def _enter(
-    pixels: NDArray[np.void], v: NDArray[np.int32], u: NDArray[np.int32], depth: Floats,
+    pixels: NDArray[np.void], where: NDArray[np.int32], width: int, stride: int, depth: Floats,
     agreement: Floats, confidence: Floats, changed: NDArray[np.uint8],
 ) -> None:
-    """Write the rays' results into the image."""
-    for n in range(len(v)):
-        pixel = pixels[v[n], u[n]]
-        changed[v[n], u[n]] = 1
+    """Write rays' results into the image; their pixels are those of the camera's image."""
+    for n in range(len(where)):
+        v, u = where[n] // width // stride, where[n] % width // stride
+        pixel = pixels[v, u]
+        changed[v, u] = 1
         pixel['depth'] = depth[n]
         counts = agreement[n] >= _MIN_AGREEMENT
-        pixel['agreement'] = min(int(agreement[n] * AGREEMENT), 65535) if counts else 0
+        pixel['agreement'] = int(min(agreement[n], 1) * AGREEMENT) if counts else 0
         pixel['confidence'] = int(255 * confidence[n] + 0.5)
 
 
 @njit(cache=True, nogil=True)
 def _turn(
-    pixels: NDArray[np.void], table: Doubles, bandwidth: Bandwidth, changed: NDArray[np.uint8]
+    pixels: NDArray[np.void], table: Doubles, bandwidth: Bandwidth, changed: NDArray[np.uint8],
+    first: int, end: int,
 ) -> None:
-    """Compute the frontality of the pixels that have changed, or whose neighbours have."""
-    height, width = pixels.shape
-    for v in range(height):
-        for u in range(width):
+    """Compute the frontality in some rows where a pixel or a neighbour has changed."""
+    for v in range(first, end):
+        for u in range(pixels.shape[1]):
             if pixels[v, u]['agreement'] == 0 or changed[v, u] == 0:
                 continue
             pixels[v, u]['frontality'] = int(
@@ -186,12 +200,12 @@ def _slope(
 
 
 @njit(cache=True, nogil=True)
-def _measure(pixels: NDArray[np.void], tiles: Floats) -> None:
-    """Write the least and the largest depth of each tile."""
-    height, width = pixels.shape
-    tiles[:, :, 0], tiles[:, :, 1] = np.inf, -np.inf
-    for v in range(height):
-        for u in range(width):
+def _measure(pixels: NDArray[np.void], tiles: Floats, first: int, end: int) -> None:
+    """Write the least and the largest depth of each tile in some rows."""
+    some = tiles[first // TILE:(end + TILE - 1) // TILE]
+    some[:, :, 0], some[:, :, 1] = np.inf, -np.inf
+    for v in range(first, end):
+        for u in range(pixels.shape[1]):
             if pixels[v, u]['agreement'] > 0:
                 tile = tiles[v // TILE, u // TILE]
                 depth = pixels[v, u]['depth']
@@ -200,14 +214,14 @@ def _measure(pixels: NDArray[np.void], tiles: Floats) -> None:
 
 @njit(cache=True, nogil=True)
 def _keys(
-    pixels: NDArray[np.void], before: Floats, changed: NDArray[np.uint8], table: Doubles,
+    pixels: NDArray[np.void], before: NDArray[np.void], changed: NDArray[np.uint8], table: Doubles,
     margin: float, R_world_camera: Doubles, t_world_camera: Doubles, sigma: Bandwidth,
-    block: float,
+    block: float, top: int, bottom: int,
 ) -> NDArray[np.int64]:
     """
-    Return the keys of the blocks in which changed pixels count, or counted.
+    Return the keys of the blocks in which changed pixels of some rows count, or counted.
 
-    :param before: (h, w) their depths before, NaN where they did not count
+    :param before: (h, w) PIXEL, as they were
     :param changed: (h, w) not 0 where a pixel or a neighbour has changed
     :param margin: more than the slope between the rays of neighbours
     """
@@ -215,9 +229,9 @@ def _keys(
     out, count = np.zeros(4096, np.int64), 0
     recent = np.full(16, -1, np.int64)
     origin = t_world_camera / block
-    for v0 in range(0, height, TILE):
-        for u0 in range(0, width, TILE):
-            v1, u1 = min(v0 + TILE, height), min(u0 + TILE, width)
+    for v0 in range(top, bottom, _SQUARE):
+        for u0 in range(0, width, _SQUARE):
+            v1, u1 = min(v0 + _SQUARE, bottom), min(u0 + _SQUARE, width)
             if not changed[v0:v1, u0:u1].any():
                 continue
             near, far = np.inf, -np.inf
@@ -226,18 +240,22 @@ def _keys(
                     if pixels[v, u]['agreement'] > 0:
                         depth = pixels[v, u]['depth']
                         near, far = min(near, depth), max(far, depth)
-                    if before[v, u] > 0:
-                        near, far = min(near, before[v, u]), max(far, before[v, u])
+                    if before[v, u]['agreement'] > 0:
+                        depth = before[v, u]['depth']
+                        near, far = min(near, depth), max(far, depth)
             if far < near:
                 continue
             reach = REACH * h3_at(sigma, far)
             near, far = near - reach, far + reach
             step = max((far - near) / _BITS, 0.5 * block)
-            mask = _mask(pixels, before, v0, v1, u0, u1, near, step, sigma)
+            bits = min(int((far - near) / step) + 1, _BITS)
+            mask = ~uint64(0)
+            if far - near > 2 * block + 2 * reach:  # there may be free space between
+                mask = _mask(pixels, before, v0, v1, u0, u1, near, step, sigma)
             cone = _cone(table, v0, v1, u0, u1, margin)
             if not cone[0] < cone[1]:
                 continue
-            for bit in range(_BITS):
+            for bit in range(bits):
                 if mask >> uint64(bit) & uint64(1) == 0:
                     continue
                 first, last = _box(
@@ -260,21 +278,19 @@ def _keys(
 
 @njit(cache=True, nogil=True)
 def _mask(
-    pixels: NDArray[np.void], before: Floats, v0: int, v1: int, u0: int, u1: int,
+    pixels: NDArray[np.void], before: NDArray[np.void], v0: int, v1: int, u0: int, u1: int,
     near: float, step: float, sigma: Bandwidth,
 ) -> np.uint64:
-    """Return bits for the steps from near on in which pixels of a tile count, or counted."""
+    """Return bits for the steps from near on in which pixels of a square count, or counted."""
     height, width = pixels.shape
     mask = uint64(0)
     for v in range(max(v0 - _HALO, 0), min(v1 + _HALO, height)):
         for u in range(max(u0 - _HALO, 0), min(u1 + _HALO, width)):
             for n in range(2):
-                if n == 0:
-                    depth = pixels[v, u]['depth'] if pixels[v, u]['agreement'] > 0 else np.nan
-                else:
-                    depth = before[v, u]
-                if not depth > 0:
+                pixel = pixels[v, u] if n == 0 else before[v, u]
+                if pixel['agreement'] == 0:
                     continue
+                depth = pixel['depth']
                 reach = REACH * h3_at(sigma, depth)
                 first = min(max(int((depth - reach - near) / step), 0), _BITS - 1)
                 last = min(max(int((depth + reach - near) / step), 0), _BITS - 1)
