@@ -4,7 +4,8 @@
 # make bench     what a frame costs, beside Open3D; docs/performance.md explains it
 # make paper     the paper's experiment again, beside Open3D; docs/results.md explains it
 # make soak      20 minutes of images into the node: memory, the cost of a frame, leaks
-# make chaos     faults around a running node, and what is lost by them; kill -9 while it writes
+# make chaos     faults around a running node, and what is lost by them; kill -9 while it writes;
+#                recordings that are damaged
 # make fuzz      what reads other people's bytes, by damaged ones: a minute for each decoder
 # make venv      only what these begin with: the environment they run in
 #
@@ -50,6 +51,7 @@ soak: venv
 chaos: venv
 	$(RUN) benchmarks/chaos.py $(ARGS)
 	$(RUN) benchmarks/kill.py
+	$(RUN) benchmarks/damaged.py
 
 paper: venv
 	$(RUN) benchmarks/paper.py $(MESH) $(ARGS)

@@ -297,6 +297,16 @@ def damaged_images(rig: Rig) -> None:
     rig.flows()
 
 
+def wrong_numbers(rig: Rig) -> None:
+    """Send calibrations and poses that are no numbers."""
+    reasons = ('dropped: uncalibrated', 'dropped: bad_pose')
+    before = [rig.count(reason) for reason in reasons]
+    rig.camera.tell('wrong 8')
+    rig.wait(lambda: all(rig.count(reason) > count for reason, count in zip(reasons, before)),
+             'the images to be counted')
+    rig.flows()
+
+
 def frames_fail(rig: Rig) -> None:
     """Have the computation of every third frame fail."""
     before = rig.count('dropped: error')
@@ -403,8 +413,8 @@ def overload(rig: Rig) -> None:
 
 FAULTS: tuple[Callable[[Rig], None], ...] = (
     publisher_killed, tf_stops, images_stop, clock_goes_back, clock_goes_forth, camera_jumps,
-    damaged_images, frames_fail, all_frames_fail, disk_full, folder_vanishes, two_nodes, overload,
-    node_killed)
+    damaged_images, wrong_numbers, frames_fail, all_frames_fail, disk_full, folder_vanishes,
+    two_nodes, overload, node_killed)
 WAITS: dict[str, list[float]] = {}  # s for answers while there is too much to do
 
 

@@ -9,7 +9,8 @@ Publishes depth/image (16UC1), depth/camera_info and /tf, stamped with the time 
 `sent N` ten times a second. The wall repeats itself every 2 m, so that FRAMES.npy, of render(),
 holds all that is ever seen. Lines on its standard input change what it does: `tf off`, `tf on`,
 `clock S` (s added to all stamps), `images off`, `images on`, `rate HZ`, `jump M` (the camera is
-elsewhere), `bad N` (that many damaged images), `end`.
+elsewhere), `bad N` (that many damaged images), `wrong N` (that many calibrations, and then poses,
+that are no numbers), `end`.
 """
 from __future__ import annotations
 
@@ -128,7 +129,7 @@ class _State:
         self.tf = self.images = True
         self.shift_ns = 0
         self.jump = 0.0
-        self.bad = 0
+        self.bad = self.uncalibrated = self.lost = 0
         self.ended = False
 
     def read(self) -> None:
@@ -143,6 +144,8 @@ class _State:
                 setattr(self, word, float(value))
             elif word == 'bad':
                 self.bad = int(value)
+            elif word == 'wrong':
+                self.uncalibrated = self.lost = int(value)
             elif word == 'end':
                 break
         self.ended = True
@@ -196,9 +199,14 @@ def main() -> None:
             message = TransformStamped(child_frame_id=_FRAME)
             message.header.stamp, message.header.frame_id = stamp, _WORLD
             _fill(message.transform, camera_pose(n * PERIOD / count))
+            if state.lost and not state.uncalibrated:
+                state.lost -= 1
+                message.transform.rotation.w = float('nan')
             transforms.publish(TFMessage(transforms=[message]))
         info.header.stamp = stamp
+        info.k[0] = float('nan') if state.uncalibrated else f
         infos.publish(info)
+        state.uncalibrated = max(state.uncalibrated - 1, 0)
         if state.bad:
             state.bad -= 1
             bad = damaged[state.bad % len(damaged)]
