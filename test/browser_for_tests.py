@@ -52,13 +52,13 @@ class Browser:
     def go(self, page: Path) -> None:
         """Load a page."""
         self._call('Page.navigate', url=page.resolve().as_uri())
+        self.until("document.readyState === 'complete'")
 
     def open(self, page: Path) -> float:
         """Load a page of `gr2t view`; return the seconds until its mesh is shown."""
         began = time.monotonic()
         self.go(page)
-        self.until("document.readyState === 'complete' && "
-                   "document.getElementById('message').hidden")
+        self.until("document.getElementById('message').hidden")
         self.settle()
         return time.monotonic() - began
 
@@ -106,6 +106,14 @@ class Browser:
         for count in range(1, times + 1):
             self._mouse('mousePressed', place, button='left', clickCount=count)
             self._mouse('mouseReleased', place, button='left', clickCount=count)
+
+    def touch(self, places: list[list[tuple[float, float]]]) -> None:
+        """Put fingers down, move them from place to place, and take them away."""
+        for kind, fingers in zip(
+                ['touchStart', *['touchMove'] * (len(places) - 1), 'touchEnd'], [*places, []],
+                strict=True):
+            self._call('Input.dispatchTouchEvent', type=kind, touchPoints=[
+                {'x': x, 'y': y, 'id': number} for number, (x, y) in enumerate(fingers)])
 
     def wheel(self, place: tuple[float, float], pixels: float) -> None:
         """Turn the wheel."""

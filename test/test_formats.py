@@ -91,6 +91,18 @@ def test_a_glb_is_as_the_standard_has_it(tmp_path: Path) -> None:
     assert colour['max'][:3] == [pytest.approx(128, abs=1)] * 3
 
 
+def test_what_is_not_finite_does_not_spoil_a_glb(tmp_path: Path) -> None:
+    """JSON knows no infinity, and glTF allows none."""
+    mesh = surface()
+    mesh.attributes['sigma'][:3] = np.inf, np.nan, 0.001
+    formats.write(tmp_path / 'mesh.glb', mesh)
+    found = gltf(tmp_path / 'mesh.glb')
+    assert all(np.isfinite(item['max']).all() for item in found['accessors'])
+    np.testing.assert_array_equal(
+        formats.read(tmp_path / 'mesh.glb').attributes['sigma'][:3],
+        np.float32((np.inf, np.inf, 0.001)))
+
+
 def test_open3d_reads_a_glb(tmp_path: Path) -> None:
     open3d = pytest.importorskip('open3d', exc_type=ImportError)
     mesh = surface()

@@ -218,3 +218,54 @@ def test_what_cannot_be_shown_is_said(
     for name in ('', 'none.ply'):
         assert cli.main(['view', str(tmp_path / name)]) == 2
         assert re.match(r'gr2t: there is no mesh .*\.ply\n$', capsys.readouterr().err)
+
+
+def test_fingers_turn_move_and_zoom(page: Browser) -> None:
+    first = spread(page.picture())
+    x, y = CENTRE
+    page.touch([[(x, y)], [(x, y + 80)], [(x, y + 150)]])
+    turned = page.picture()
+    seen = turned[:, 300:][mesh_of(turned)]
+    assert seen[:, 0].mean() > 2 * seen[:, 2].mean(), 'from above it is red'
+    page.touch([[(x - apart, y), (x + apart, y)] for apart in (40, 60, 80)])
+    larger = spread(page.picture())
+    assert larger[2] > 2 * first[2]
+    page.touch([[(x - 40, y), (x + 40, y)], [(x - 40, y + 50), (x + 40, y + 50)]])
+    assert spread(page.picture())[1] - larger[1] == pytest.approx(50, abs=8)
+
+
+def odd_meshes() -> dict[str, formats.Mesh]:
+    """Return meshes that one may meet."""
+    vertices, faces = np.eye(3), np.array([(0, 1, 2)], np.int32)
+    nothing = np.zeros(3, np.float32)
+    return {
+        'a triangle': formats.Mesh(vertices, faces),
+        'a point': formats.Mesh(np.ones((3, 3)), faces),
+        'no likelihood anywhere': formats.Mesh(vertices, faces, None, {
+            'likelihood': nothing, 'sigma': np.full(3, np.nan, np.float32),
+            'confidence': nothing}),
+        'far away': formats.Mesh(vertices * 1e-3 + 1e6, faces, None, {
+            'sigma': np.array((np.inf, 1e-3, 2e-3), np.float32)})}
+
+
+@pytest.mark.parametrize('name', odd_meshes())
+def test_odd_meshes_are_pages_too(name: str, chromium: Browser, tmp_path: Path) -> None:
+    title = '</script><b>@DATA@ & "quoted"'
+    view.write(tmp_path / 'page.html', odd_meshes()[name], [], title)
+    chromium.errors.clear()
+    chromium.open(tmp_path / 'page.html')
+    chromium.click(CENTRE, times=2)
+    chromium.picture()
+    assert chromium.errors == []
+    assert chromium.run("document.querySelector('h1').textContent") == title
+    assert 'NaN' not in chromium.run('document.body.innerText')
+
+
+def test_a_browser_that_cannot_show_it_says_so(chromium: Browser, tmp_path: Path) -> None:
+    view.write(tmp_path / 'page.html', ball(), [], 'ball')
+    page = (tmp_path / 'page.html').read_text(encoding='utf-8')
+    (tmp_path / 'page.html').write_text(page.replace("'webgl2'", "'webgl9'"), encoding='utf-8')
+    chromium.go(tmp_path / 'page.html')
+    chromium.until("document.getElementById('message').textContent.startsWith('Cannot')")
+    assert text(chromium, 'message') == (
+        'Cannot show the mesh: this browser has no WebGL 2.')

@@ -26,6 +26,7 @@ WRITTEN = {
     '.glb': '',
     '.obj': 'OBJ files hold colours, but no likelihood, sigma and confidence',
     '.stl': 'STL files hold the surface alone: no colours, likelihood, sigma and confidence'}
+_LARGEST = float(np.finfo(np.float32).max)
 _Y_UP = ('.glb', '.gltf')  # glTF has y up, and linear colours; this package z up, as REP 103
 
 
@@ -106,7 +107,7 @@ def _attributes(mesh: Any) -> dict[str, NDArray[np.float32]]:
         except (IndexError, KeyError, TypeError, ValueError):
             continue
         if len(values) == len(mesh.vertices):
-            found[name] = values
+            found[name] = np.where(values == _LARGEST, np.float32(np.inf), values)
     return found
 
 
@@ -141,7 +142,9 @@ def write(path: Path, mesh: Mesh) -> None:
     if ending in _Y_UP:
         x, y, z = vertices.T
         vertices = np.column_stack([x, z, -y])
-        attributes = {f'_{name.upper()}': values for name, values in mesh.attributes.items()}
+        attributes = {  # which must be finite there
+            f'_{name.upper()}': np.nan_to_num(values, nan=_LARGEST)
+            for name, values in mesh.attributes.items()}
         visual = _double_sided(colours)
     elif colours is not None:
         visual = ColorVisuals(vertex_colors=colours)

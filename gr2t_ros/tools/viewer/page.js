@@ -12,7 +12,13 @@ class Camera {
     Object.assign(this, header.view);  // pivot, eye, forward, upward
   }
 
-  get right() { return unit(cross(this.forward, this.upward)); }
+  get right() {
+    const {forward, upward} = this, right = cross(forward, upward);
+    // straight up or down any side is right
+    const [x, y, z] = upward;
+    return unit(Math.hypot(...right) > 1e-6 ? right : cross(forward, [y, z, x]));
+  }
+
   get down() { return cross(this.forward, this.right); }
   get distance() { return dot(add(this.pivot, this.eye, -1), this.forward); }
 
