@@ -14,8 +14,9 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import closing, suppress
 from functools import lru_cache
+import hashlib
 import io
 import os
 from pathlib import Path
@@ -40,9 +41,11 @@ def decoders() -> dict[str, Decoder]:
     from messages_for_tests import compressed, TYPES
     import numpy as np
 
+    from gr2t_ros.core.reconstruction import Reconstruction
     from gr2t_ros.errors import FrameError, InputError
     from gr2t_ros.io import formats, messages
     from gr2t_ros.io.bags import Bag
+    from gr2t_ros.io.map_file import MapFile
     from gr2t_ros.io.salvage import Salvage
     from gr2t_ros.io.salvage_mcap import McapSalvage
     from gr2t_ros.io.salvage_rosbag1 import Rosbag1Salvage
@@ -121,6 +124,15 @@ def decoders() -> dict[str, Decoder]:
         found = formats.read(file('mesh.ply', data))
         return found.vertices[found.faces]
 
+    def map_file(data: bytes) -> object:
+        """Load a map whose checksum fits, so that the rest has to notice what is wrong."""
+        path = file('map.gr2t', data + hashlib.sha256(data).digest())
+        with MapFile(path) as opened, closing(Reconstruction(
+                opened.settings.updated({'threads': 1}))) as reconstruction:
+            opened.load(reconstruction)
+            reconstruction.finish(0.0)
+            return list(reconstruction.meshes())
+
     def pose(data: bytes) -> object:
         msg = decoded(data, 'nav_msgs/msg/Odometry')
         return msg and messages.pose(msg, 'odometry')
@@ -136,7 +148,7 @@ def decoders() -> dict[str, Decoder]:
         'mcap_salvage': salvage(McapSalvage), 'rosbag1_salvage': salvage(Rosbag1Salvage),
         'db3_salvage': salvage(lambda content: Sqlite3Salvage(file('scan.db3', content.read()))),
         'compressed_depth': compressed_depth, 'image': image, 'camera_info': camera_info, 'tf': tf,
-        'pose': pose, 'ply': mesh,
+        'pose': pose, 'ply': mesh, 'map': map_file,
     }.items()}
 
 
@@ -146,9 +158,14 @@ def seeds(folder: Path) -> None:
     import cv2
     import numpy as np
 
+    from gr2t_ros.core.camera import Camera
     from gr2t_ros.core.colour import Colouring
+    from gr2t_ros.core.reconstruction import Reconstruction
+    from gr2t_ros.core.view import View
     from gr2t_ros.core.view_mesh import ViewMesh
     from gr2t_ros.io import ply
+    from gr2t_ros.io.map_file import save_map
+    from gr2t_ros.settings import Settings
 
     def seed(name: str, data: bytes) -> None:
         (folder / name).mkdir(exist_ok=True)
@@ -176,6 +193,15 @@ def seeds(folder: Path) -> None:
         ones = np.ones(3, np.float32)
         mesh = ViewMesh(np.eye(3), ones, ones, ones, np.array([[0, 1, 2]], np.int32),
                         np.array([[0, 1]], np.int32), ones[:1])
+        for density in ('voxel', 'exact'):
+            settings = Settings(
+                density=density, voxel_size=0.9, depth_bandwidth=0.9, pixel_bandwidth=0.5)
+            path = Path(scratch) / f'{density}.gr2t'
+            with closing(Reconstruction(settings)) as reconstruction:
+                reconstruction.add(View(
+                    np.ones((3, 4), np.float32), Camera(4, 3, 4.0, 4.0, 1.5, 1.0), np.eye(4), 1))
+                save_map(path, reconstruction, 'map')
+            seed('map', path.read_bytes()[:-32])
         seed('ply', ply.write_view(
             Path(scratch) / 'mesh.ply', 0, mesh,
             Colouring('likelihood', 1.0, 'turbo')).path.read_bytes())
@@ -191,11 +217,15 @@ def fuzz(name: str, arguments: list[str]) -> None:
     import rosbags.typesys
     rosbags.typesys.get_types_from_msg = lru_cache(rosbags.typesys.get_types_from_msg)
     rosbags.highlevel.anyreader.get_types_from_msg = rosbags.typesys.get_types_from_msg
-    import gr2t_ros.core  # noqa: F401
-    # atheris cannot look into what is compiled, and Python notices bad indices
-    numba.config.DISABLE_JIT = True
+    import gr2t_ros.core
+    # atheris cannot look into what is compiled, and Python notices bad indices; a map's kernels
+    # do not run in Python, and are to be safe by what is checked before
+    numba.config.DISABLE_JIT = name != 'map'
+    if name == 'map':
+        import gr2t_ros.core.reconstruction  # noqa: F401
     with atheris.instrument_imports(include=[
-            'gr2t_ros.io', 'gr2t_ros.core.camera', 'gr2t_ros.core.poses', 'trimesh.exchange']):
+            'gr2t_ros.io', 'gr2t_ros.core.camera', 'gr2t_ros.core.poses', 'gr2t_ros.core.state',
+            'trimesh.exchange']):
         decode = decoders()[name]
     atheris.Setup([sys.argv[0], *arguments], decode)
     atheris.Fuzz()
