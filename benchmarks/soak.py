@@ -52,7 +52,7 @@ SETTINGS = {
 BESIDE_MB = 600  # the process' memory besides the map's
 _FLAT = 0.10
 _LAST = 5.0  # s after the last image for what is on its way
-_PATIENCE = 180.0  # s for the kernels
+_PATIENCE = 900.0  # s for the kernels, where they have to be compiled beside other work
 _LEAK = 1.0  # MB a minute
 
 
@@ -109,15 +109,15 @@ class Soak:
                 self._watch(node, process, None, _LAST)
             except KeyboardInterrupt:
                 print('\nended early', flush=True)
-            survived = process.poll() is None
-            if survived:
-                process.send_signal(signal.SIGINT)
-                survived = process.wait(timeout=60) == 0
-            self._count_parts()
-            node.destroy_node()
-            rclpy.try_shutdown()
-        if not survived:
-            print(log.read_text(errors='replace')[-3000:])
+            finally:
+                survived = process.poll() is None
+                if survived:
+                    survived = _ended(process) == 0
+                self._count_parts()
+                node.destroy_node()
+                rclpy.try_shutdown()
+        said = log.read_text(errors='replace')
+        print(said[said.rfind('frames: '):] if survived else said[-3000:])
         return survived
 
     def _wait(self, node: Node, process: subprocess.Popen[bytes], log: Path) -> None:
@@ -236,6 +236,16 @@ class Soak:
         bottom.legend()
         bottom.set_xlabel('minutes')
         figure.savefig(path, dpi=120)
+
+
+def _ended(process: subprocess.Popen[bytes]) -> int:
+    """End the node; return its exit code."""
+    process.send_signal(signal.SIGINT)
+    try:
+        return process.wait(timeout=120)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        return process.wait()
 
 
 def _resident_mb(pid: int) -> float:

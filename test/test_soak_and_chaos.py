@@ -4,6 +4,7 @@
 import os
 from pathlib import Path
 import re
+import signal
 import subprocess
 import sys
 
@@ -13,24 +14,29 @@ pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
 PROJECT = Path(__file__).resolve().parents[1]
-LIMIT = 300.0  # s: for what takes ten on a machine that does nothing else
+LIMIT = 1200.0  # s: kernels may have to be compiled, beside other work
 
 
 def run(name: str, *arguments: str) -> str:
     """Run a benchmark; return what it prints."""
     path = os.pathsep.join([str(PROJECT), os.environ.get('PYTHONPATH', '')])
-    done = subprocess.run(
-        [sys.executable, str(PROJECT / 'benchmarks' / name), *arguments], text=True,
-        env={**os.environ, 'PYTHONPATH': path},
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, timeout=LIMIT, check=False)
-    assert done.returncode == 0, done.stdout
-    return done.stdout
+    with subprocess.Popen(
+            [sys.executable, str(PROJECT / 'benchmarks' / name), *arguments], text=True,
+            env={**os.environ, 'PYTHONPATH': path}, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT) as process:
+        try:
+            said, _ = process.communicate(timeout=LIMIT)
+        except BaseException:
+            process.send_signal(signal.SIGINT)  # it ends the node that it started
+            raise
+    assert process.returncode == 0, said
+    return said
 
 
 def test_a_short_soak() -> None:
     """Keyframes leave memory, and all that left is on the disk."""
     said = run(
-        'soak.py', '--minutes', '0.15', '--memory', '12', '--size', '160', '120', '--speed', '1')
+        'soak.py', '--minutes', '0.15', '--memory', '24', '--size', '160', '120', '--speed', '1')
     keyframes, left, parts = map(int, re.search(
         r'left memory / parts on the disk +(\d+) / (\d+) / (\d+)', said).groups())
     assert 0 < left == parts < keyframes

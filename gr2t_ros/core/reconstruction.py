@@ -96,18 +96,21 @@ class Reconstruction:
     Meshes from depth images with known poses.
 
     :param settings: bandwidths, thresholds, keyframe distances, threads
-    :param sink: takes the meshes of keyframes that leave where max_memory_mb is full, as
-        MemoryBound has it; without one there is no bound; may be set
+    :param sink: takes meshes that leave where max_memory_mb is full, see MemoryBound; may be set
+    :param copied: whether max_memory_mb has to leave room for what frozen returns
 
     `keyframes` are the views that own a mesh, `density` is what all views built, `fused` makes one
     mesh of the keyframes where it is asked to, `stamp_ns` is the newest stamp of these views.
     """
 
-    def __init__(self, settings: Settings, sink: Sink | None = None) -> None:
+    def __init__(
+        self, settings: Settings, sink: Sink | None = None, copied: bool = False
+    ) -> None:
         self.settings = settings
         self.keyframes: list[Keyframe] = []
         self.stamp_ns = 0
         self.sink = sink
+        self.copied = copied
         self._bound = MemoryBound()
         self._density: Density | None = None
         self.fused = FusedMap()

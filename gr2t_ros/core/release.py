@@ -19,9 +19,10 @@ import numpy as np
 
 from ..errors import FrameError, Gr2tError
 from ..settings import Settings
+from . import fused_grid
 from .blocks import BYTES_PER_BLOCK, VOXELS
 from .colour import Colouring
-from .ray_march import Density, march, Rays, stale
+from .ray_march import march, Rays, stale
 from .view import View
 from .voxel_density import VoxelDensity
 
@@ -32,9 +33,13 @@ if TYPE_CHECKING:
 Sink = Callable[[int, 'ViewMesh', Colouring], None]
 
 _SLOTS = 4 * (8 + 4)  # bytes of the hash for a block, at least
-# with what a snapshot copies of it, see frozen.py
-_BYTES = BYTES_PER_BLOCK + _SLOTS + (BYTES_PER_BLOCK - 4 * VOXELS)
 BYTES_PER_RAY = 28
+# what a block and a ray come to: with the fused map that is made in the end, or for a snapshot;
+# with the copy for that, see frozen.py, too, of rays also what changes while it is written
+_BLOCK = BYTES_PER_BLOCK + _SLOTS + fused_grid.BYTES_PER_BLOCK
+_BLOCK_COPIED = _BLOCK + BYTES_PER_BLOCK - 4 * VOXELS
+_RAY = BYTES_PER_RAY + 10
+_RAY_COPIED = _RAY + 30
 _AT_WORK = 8  # keyframes, the newest, that are never released
 _RECENT = 50  # changes: blocks that a view touched since then stay
 _PAUSE = 5.0  # s before a sink that failed is tried again
@@ -70,7 +75,7 @@ class MemoryBound:
             return
         limit = limit_of(engine.settings)
         if isinstance(engine.density, VoxelDensity):
-            engine.density.most_blocks = limit // _BYTES
+            engine.density.most_blocks = limit // _BLOCK
         while used_by(engine) > limit:
             number, _ = _farthest(engine, view)
             if number is None:
@@ -114,24 +119,17 @@ def limit_of(settings: Settings) -> int:
 
 
 def used_by(engine: Reconstruction) -> int:
-    """Return a map's bytes: blocks, also as copied for a snapshot, keyframes, the fused map."""
+    """Return a map's bytes, with what is kept free for making meshes of it."""
     if not engine.keyframes:
         return 0
-    return bytes_of_density(engine.density) + engine.fused.nbytes + sum(
-        map(bytes_of_keyframe, engine.keyframes))
-
-
-def bytes_of_density(density: Density) -> int:
-    """Return the bytes of a density, with the copy that a snapshot makes of it."""
-    if isinstance(density, VoxelDensity):
-        return _BYTES * density.blocks.size
-    return sum(np.asarray(array).nbytes for array in density.state.views)
-
-
-def bytes_of_keyframe(keyframe: Keyframe) -> int:
-    """Return the bytes of a keyframe: its image, its rays, its list of blocks."""
-    blocks = keyframe.blocks.nbytes if keyframe.blocks is not None else 0
-    return keyframe.view.depth.nbytes + BYTES_PER_RAY * len(keyframe.rays.pixels) + blocks
+    block, ray = (_BLOCK_COPIED, _RAY_COPIED) if engine.copied else (_BLOCK, _RAY)
+    used = engine.fused.nbytes
+    for keyframe in engine.keyframes:
+        used += keyframe.view.depth.nbytes + ray * len(keyframe.rays.pixels)
+        used += keyframe.blocks.nbytes if keyframe.blocks is not None else 0
+    if isinstance(engine.density, VoxelDensity):
+        return used + block * engine.density.blocks.size
+    return used + sum(np.asarray(array).nbytes for array in engine.density.state.views)
 
 
 def _farthest(engine: Reconstruction, view: View) -> tuple[int | None, float]:

@@ -388,7 +388,7 @@ class Worker:
 
     def _empty(self) -> Reconstruction:
         return Reconstruction(
-            self._settings, Parts(lambda: new_directory(self.saver.folder.made())))
+            self._settings, Parts(lambda: new_directory(self.saver.folder.made())), copied=True)
 
     def _replace(self, reconstruction: Reconstruction) -> None:
         self._reconstruction.close()
