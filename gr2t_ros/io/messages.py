@@ -13,17 +13,15 @@ from math import hypot, isfinite
 import struct
 from typing import Any, NamedTuple
 
-import cv2
-from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
 from ..core.camera import Camera
 from ..core.poses import plain, Pose, seconds
 from ..errors import FrameError
+from . import depth_codecs
 
-MAX_PIXELS = 1 << 25  # of an image; 134 MB as float32, four times the largest depth camera
-MAX_BYTES = 5 * MAX_PIXELS  # of an image's message, padding and all
+MAX_BYTES = 5 * depth_codecs.MAX_PIXELS  # of an image's message, padding and all
 _TYPES = {'16UC1': 'u2', 'mono16': 'u2', '32FC1': 'f4'}
 _KNOWN = '16UC1 and mono16 (millimetres), 32FC1 (metres)'
 _NO_RETURN = 65535  # with 0: how drivers write "no depth" in whole millimetres
@@ -34,10 +32,6 @@ _MAX_COEFFICIENTS = 100  # of a distortion; OpenCV's models have 14 at most
 _MAX_NAME = 256  # characters of a frame's name that count
 
 _CONFIG = struct.Struct('<iff')  # compressedDepth: format, depth quantisation A and B
-_PNG = b'\x89PNG\r\n\x1a\n'
-_PNG_CHUNK = struct.Struct('>I4s')  # length of the content, name; a checksum follows
-_PNG_HEADER = struct.Struct('>8xIIBB')  # the first chunk: width, height, bits, colour type
-_RVL_SIZE = struct.Struct('<II')  # columns, rows
 
 
 class StampedPose(NamedTuple):
@@ -90,14 +84,8 @@ def size(msg: Any) -> tuple[int, int]:
     """
     if not hasattr(msg, 'format'):
         return int(msg.height), int(msg.width)
-    head = bytes(msg.data[_CONFIG.size:_CONFIG.size + len(_PNG) + _PNG_HEADER.size])
-    if 'rvl' in str(msg.format)[:60]:
-        width, height = _RVL_SIZE.unpack_from(head) if len(head) >= _RVL_SIZE.size else (0, 0)
-    elif head.startswith(_PNG) and len(head) == len(_PNG) + _PNG_HEADER.size:
-        width, height, _, _ = _PNG_HEADER.unpack_from(head, len(_PNG))
-    else:
-        width = height = 0
-    return height, width
+    head = bytes(msg.data[_CONFIG.size:_CONFIG.size + depth_codecs.HEAD])
+    return depth_codecs.size(head, rvl='rvl' in str(msg.format)[:60])
 
 
 def depth(msg: Any) -> NDArray[np.float32]:
@@ -122,7 +110,7 @@ def depth_image(msg: Any) -> NDArray[np.float32]:
     """
     encoding = _encoding(msg.encoding)
     height, width, step = int(msg.height), int(msg.width), int(msg.step)
-    _check_size(height, width)
+    depth_codecs.check_size(height, width)
     dtype = np.dtype(('>' if msg.is_bigendian else '<') + _TYPES[encoding])
     row = width * dtype.itemsize
     if step < row:
@@ -156,7 +144,7 @@ def compressed_depth(msg: Any) -> NDArray[np.float32]:
             '16UC1 and 32FC1 with "compressedDepth png" or "compressedDepth rvl"')
     data = bytes(msg.data)
     if len(data) < _CONFIG.size:
-        raise _damaged(f'{len(data)} bytes of data')
+        raise depth_codecs.damaged(f'{len(data)} bytes of data')
     _, a, b = _CONFIG.unpack_from(data)
     raw = decode(data[_CONFIG.size:])
     if encoding != '32FC1':
@@ -181,7 +169,7 @@ def mask(msg: Any) -> NDArray[np.bool_]:
     if msg.encoding not in ('mono8', '8UC1'):
         raise FrameError(
             'mask', f'the mask has encoding {str(msg.encoding)[:40]!r}; mono8 and 8UC1 are known')
-    if not 0 < height * width <= MAX_PIXELS or step < width or (
+    if not 0 < height * width <= depth_codecs.MAX_PIXELS or step < width or (
             len(msg.data) < step * (height - 1) + width):
         raise FrameError('mask', f'the mask of {width}x{height} pixels with step {step} has '
                          f'{len(msg.data)} bytes of data: its publisher writes wrong headers')
@@ -289,13 +277,6 @@ def _encoding(encoding: str) -> str:
     return encoding
 
 
-def _check_size(height: int, width: int) -> None:
-    if height <= 0 or width <= 0 or height * width > MAX_PIXELS:
-        raise FrameError(
-            'image_size', f'depth image is {width}x{height} pixels; from 1 to {MAX_PIXELS} are '
-            'taken')
-
-
 def _metres(raw: NDArray[Any]) -> NDArray[np.float32]:
     """Return float32 metres of whole millimetres or floating metres, NaN where invalid."""
     if raw.dtype.kind == 'u':
@@ -307,110 +288,6 @@ def _metres(raw: NDArray[Any]) -> NDArray[np.float32]:
     return metres
 
 
-def _damaged(what: str) -> FrameError:
-    return FrameError('damaged_image', f'compressed depth image is damaged: {what}')
-
-
-def _png(data: bytes) -> NDArray[np.uint16]:
-    if not data.startswith(_PNG):
-        raise _damaged('its data are no PNG')
-    chunks = _png_chunks(data)
-    if not chunks[0].startswith(b'IHDR', 4) or len(chunks[0]) < _PNG_HEADER.size:
-        raise _damaged('its PNG has no header')
-    width, height, bits, colour = _PNG_HEADER.unpack_from(chunks[0])
-    _check_size(height, width)
-    if (bits, colour) != (16, 0):
-        raise _damaged(f'its PNG has {bits} bits and colour type {colour}, not 16 bits of grey')
-    clean = np.frombuffer(_PNG + b''.join(chunks), np.uint8)
-    try:
-        image: Any = cv2.imdecode(clean, cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        image = None
-    if image is None or image.dtype != np.uint16 or image.shape != (height, width):
-        raise _damaged('its PNG cannot be decoded')
-    return np.asarray(image)
-
-
-def _png_chunks(data: bytes) -> list[bytes]:
-    """
-    Return those chunks of a PNG that the image needs; the last is IEND.
-
-    OpenCV believes a damaged length and takes gigabytes; the other chunks only add to what can
-    go wrong in it.
-    """
-    chunks = []
-    at, name = len(_PNG), b''
-    while name != b'IEND':
-        end = at + _PNG_CHUNK.size
-        if end <= len(data):
-            length, name = _PNG_CHUNK.unpack_from(data, at)
-            end += length + 4
-        if end > len(data):
-            raise _damaged('its PNG is cut off')
-        if name in (b'IHDR', b'IDAT', b'IEND'):
-            chunks.append(data[at:end])
-        at = end
-    return chunks
-
-
-def _rvl(data: bytes) -> NDArray[np.uint16]:
-    if len(data) < _RVL_SIZE.size:
-        raise _damaged(f'{len(data)} bytes of RVL')
-    width, height = _RVL_SIZE.unpack_from(data)
-    _check_size(height, width)
-    words = np.array(np.frombuffer(data, '<u4', len(data) // 4 - 2, 8), np.uint32)
-    pixels = np.zeros(height * width, np.uint16)
-    if not _decode_rvl(words, pixels):
-        raise _damaged(f'its RVL does not make {width}x{height} pixels')
-    return pixels.reshape(height, width)
-
-
-@njit(cache=True, nogil=True)
-def _decode_rvl(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """
-    Decode RVL (Wilson, Fast Lossless Depth Image Compression, 2017).
-
-    Runs of zeros and of others take turns; each other is the zigzag-coded difference to the one
-    before. Numbers are groups of three bits, the lowest first, in nibbles whose top bit says that
-    more follow; nibbles fill 32-bit words from the top.
-
-    :param words: (n,) uint32
-    :param pixels: (m,) uint16, zero, filled
-    :return: whether the words made exactly m pixels
-    """
-    nibbles = 8 * len(words)
-    at = 0  # nibble
-    filled = 0
-    left = 0  # others left in this run
-    previous = 0
-    zeros_next = True
-    while filled < len(pixels) or left != 0:
-        value = 0
-        shift = 0
-        more = True
-        while more:
-            if at == nibbles or shift > 30:
-                return False
-            nibble = (int(words[at >> 3]) >> (28 - 4 * (at & 7))) & 15
-            at += 1
-            value |= (nibble & 7) << shift
-            shift += 3
-            more = nibble & 8 != 0
-        if left > 0:
-            previous = (previous + ((value >> 1) ^ -(value & 1))) & 0xffff
-            pixels[filled] = previous
-            filled += 1
-            left -= 1
-        else:
-            if value > len(pixels) - filled:
-                return False
-            if zeros_next:
-                filled += value
-            else:
-                left = value
-            zeros_next = not zeros_next
-    return True
-
-
 _DECODERS: dict[str, Callable[[bytes], NDArray[np.uint16]]] = {
-    '': _png, 'compressedDepth': _png, 'compressedDepth png': _png, 'compressedDepth rvl': _rvl}
+    '': depth_codecs.png, 'compressedDepth': depth_codecs.png,
+    'compressedDepth png': depth_codecs.png, 'compressedDepth rvl': depth_codecs.rvl}
