@@ -12,7 +12,7 @@ from .confidence import deviations
 from .ray_march import Density, Rays
 
 _PERCENTILE = 98.0
-_RAYS = 4_000_000  # of which the likelihoods are looked at
+_RAYS = 250_000  # of which the likelihoods are looked at
 _DEVIATIONS = 50_000
 
 
