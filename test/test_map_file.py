@@ -82,7 +82,8 @@ def test_it_goes_on_as_if_it_had_not_been_interrupted(
     tmp_path: Path, density: str, finished: bool
 ) -> None:
     """Also where its voxel size followed from the first frame."""
-    settings = SETTINGS.updated({'density': density, 'voxel_size': 0.0})
+    settings = SETTINGS.updated(
+        {'density': density, 'voxel_size': 0.0, 'cameras': ('front', 'rear')})
     some = [replace(view, stamp_ns=10 + n, frame_id='optical', camera_name='front')
             for n, view in enumerate(bumpy_views() + bumpy_views(1))]
     whole, half = built(some[:5], settings), built(some[:5], settings)

@@ -179,6 +179,8 @@ class Saver:
 
     def _report(self, name: str, answer: Future[Any]) -> None:
         error = answer.exception()
+        if error and self._map.stopping:
+            return  # it was given up, as it should
         self.problem = f'no periodic {name}: {error}' if error else ''
         if error:
             self._log.error(self.problem)

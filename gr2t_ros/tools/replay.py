@@ -165,12 +165,15 @@ def _settings(args: argparse.Namespace, resumed: MapFile | None) -> Settings:
 def _parts(directory: Path, resumed: MapFile | None) -> Parts:
     """Return where what leaves memory goes; nothing of another map is left there."""
     folder = directory / _PARTS
-    if resumed and resumed.path.resolve().parent == directory.resolve():
+    ours = resumed is not None and resumed.path.resolve().parent == directory.resolve()
+
+    def made() -> Path:
         folder.mkdir(exist_ok=True)
-        return Parts(lambda: folder)
+        return folder if ours else emptied(folder)
+
     if folder.is_dir():
-        emptied(folder)
-    return Parts(lambda: emptied(folder))
+        made()
+    return Parts(made)
 
 
 class _Replay:
