@@ -2,6 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Any kind of recording gives the same views; the topics to use are found, or asked for."""
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 import re
 
@@ -269,6 +270,34 @@ def test_damage_that_shows_while_reading_costs_no_other_message(tmp_path: Path) 
             rf'{len(content)} bytes are damaged or lost: from byte \d+ to \d+, after 4.\d s',
             bag.damage)
         assert [log_ns for _, _, log_ns in bag.messages(bag.topics)] == stamps
+
+
+@pytest.mark.parametrize('kind', ['mcap', 'sqlite3', 'rosbag1'])
+def test_messages_twice_out_of_order_and_of_other_times(tmp_path: Path, kind: str) -> None:
+    """Each image that is in order is used once; the others are counted."""
+    messages = bags.scan(20)
+    late = [replace(message, log_ns=message.log_ns + 1_000_000_000)
+            for message in messages if message.topic == '/tf'][::3]
+    twice = [replace(bags.image(index), log_ns=bags.image(index).log_ns + 3_000_000)
+             for index in range(5, 10)]
+    # an hour later, an hour before, and two that were logged in the wrong order
+    other = [replace(bags.image(index, data=bags.depth(0)), log_ns=bags.image(7).log_ns + 1)
+             for index in (36_007, -36_000)]
+    swapped = [replace(bags.image(index), log_ns=bags.image(27 - index).log_ns)
+               for index in (13, 14)]
+    kept = [message for message in messages if message not in late and not (
+        message.topic == DEPTH and message.log_ns in (item.log_ns for item in swapped))]
+    path = bags.write(tmp_path / 'scan', [*kept, *late, *twice, *other, *swapped], kind)
+    with Bag([path]) as bag:
+        sources = topics.choose(bag)
+        assembler = FrameAssembler(
+            Settings(world_frame=sources.poses.world_frame), rectified=True, max_waiting=50)
+        found = list(views(bag, sources, assembler))
+        assert bag.damage == ''
+    assert sorted(view.stamp_ns for view in found) == [bags.stamp(index) for index in range(20)]
+    assert assembler.dropped.pop('duplicate') == 5
+    assert assembler.dropped.total() == 2
+    assert assembler.read == 27
 
 
 def test_the_folder_of_a_killed_recorder(tmp_path: Path) -> None:

@@ -58,8 +58,11 @@ class Bag:
 
     def _files_in(self, folder: Path) -> list[Path]:
         """Return the files of a rosbag2 folder; the metadata.yaml of a killed recorder lacks."""
-        inside = sorted(
-            (file for file in folder.iterdir() if file.name.endswith(ENDINGS)), key=_in_order)
+        try:
+            inside = sorted(
+                (file for file in folder.iterdir() if file.name.endswith(ENDINGS)), key=_in_order)
+        except OSError as error:
+            raise InputError(f'{folder} cannot be read: {error.strerror or error}') from error
         try:
             metadata = yaml.safe_load((folder / 'metadata.yaml').read_bytes())
             names = [Path(name).name for name in

@@ -20,7 +20,8 @@ from .camera_poses import CameraPoses
 from .world import World
 
 _MAX_CAMERAS = 16  # frames of which a camera_info is kept
-_TWICE_NS = 250_000_000  # between the stamps of images when one comes twice; more is a loop
+_TWICE_NS = 250_000_000  # an image that comes twice is older by less; more is a loop
+_MAX_SEEN = 20  # images whose stamps are kept to notice it
 _MAX_BYTES = 1 << 29  # of the images that wait
 _LARGE = 1 << 22  # pixels; smaller images may come a moment before their camera_info
 _MAX_STAMP_NS = (1 << 31) * 1_000_000_000  # what ROS's messages can say
@@ -85,7 +86,7 @@ class FrameAssembler:
         self._masks: dict[int, NDArray[np.bool_]] = {}  # by stamp
         self._newest_ns = 0  # of the views, by the images' clock
         self._older = False  # whether the last image was of another time
-        self._seen: set[tuple[str, int]] = set()  # frames and stamps of the last images
+        self._seen: dict[tuple[str, int], None] = {}  # frames and stamps of the last images
         self._images: deque[_Image] = deque()
         self._views: list[View] = []
 
@@ -180,7 +181,8 @@ class FrameAssembler:
             raise FrameError(
                 'bad_stamp', f'an image has the stamp {seconds(stamp_ns)}, which no clock has: '
                 'its driver writes wrong headers')
-        if any(stamp_ns < seen_ns - _TWICE_NS for _, seen_ns in self._seen):
+        # further back than MAX_DISORDER_NS it is a stray, until another one comes
+        if any(_TWICE_NS < seen_ns - stamp_ns <= MAX_DISORDER_NS for _, seen_ns in self._seen):
             self._seen.clear()
         if (frame, stamp_ns) in self._seen:
             raise FrameError(
@@ -188,9 +190,10 @@ class FrameAssembler:
                 'once; does the topic have two publishers, or the recording a part twice?')
 
     def _remember(self, frame: str, stamp_ns: int) -> None:
-        self._seen = {item for item in self._seen if item[1] > stamp_ns - _TWICE_NS}
         if stamp_ns:  # 0: of a driver that writes none
-            self._seen.add((frame, stamp_ns))
+            self._seen[frame, stamp_ns] = None
+            if len(self._seen) > _MAX_SEEN:
+                del self._seen[next(iter(self._seen))]
 
     def is_of_another_time(self, now_ns: int) -> bool:
         """Tell whether images were taken well after a stamp, so that the clock went back to it."""
