@@ -25,8 +25,9 @@ import trimesh
 import tsdf
 
 from gr2t_ros.core.ray_march import march, rays_of
-from gr2t_ros.core.reconstruction import Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.view import View
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.distance import Surface
 from gr2t_ros.tools.noise import Noise

@@ -41,8 +41,9 @@ from truth import Geometry, Truth
 import tsdf
 
 from gr2t_ros.core.fused_mesh import SurfaceMesh
-from gr2t_ros.core.reconstruction import Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.view import View
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.evaluate import nause
 from gr2t_ros.tools.noise import Noise

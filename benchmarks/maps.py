@@ -25,10 +25,11 @@ import numpy as np
 
 from gr2t_ros.core.blocks import VOXELS
 from gr2t_ros.core.merge import add_map
-from gr2t_ros.core.reconstruction import Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.state import state_of
 from gr2t_ros.core.view import View
 from gr2t_ros.core.voxel_density import VoxelDensity
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.io.map_file import MapFile, save_map
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.report import peak_memory_mb

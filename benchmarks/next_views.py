@@ -61,15 +61,14 @@ def suggested(views: list[View]) -> tuple[Attention, float]:
         for view in views:
             reconstruction.add(view)
         reconstruction.finish()
-        reconstruction.fuse()
-        where_next(reconstruction)
+        mesh = reconstruction.fused_mesh()
+        where_next(reconstruction, mesh)  # compiles
         began = perf_counter()
-        return where_next(reconstruction), perf_counter() - began
+        return where_next(reconstruction, mesh), perf_counter() - began
 
 
 def row(
-    name: str, mesh: trimesh.Trimesh, poses: list[Pose], side: float, left_out: float,
-    noise: Noise,
+    mesh: trimesh.Trimesh, poses: list[Pose], side: float, left_out: float, noise: Noise
 ) -> dict[str, Any]:
     """Leave one side out of a scan, and return what the suggested views see of it."""
     centre = mesh.bounds.mean(axis=0)
@@ -92,7 +91,7 @@ def row(
     by_us = np.cumsum([seen(view.T_world_camera)[missing] for view in found.views], axis=0) > 0
     first, third = by_us[0].mean(), by_us[:3][-1].mean()
     return {
-        'scan': name, 'side': f'{side:.0f}', 'missing cm2': 1e4 * mesh.area * missing.mean(),
+        'side': f'{side:.0f}', 'missing cm2': 1e4 * mesh.area * missing.mean(),
         'off by': f'{between(side_of(found.views[0].T_world_camera, centre), side):.0f}',
         'first': float(first), 'first three': float(third), 'best left out': float(shares.max()),
         'mean left out': float(shares.mean()), 'first / best': float(first / shares.max()),
@@ -115,9 +114,9 @@ def main() -> None:
         poses = orbit(mesh.bounds.mean(axis=0), 0.35, CAMERAS)
         scans += [(arguments.mesh.stem, mesh, poses, NOISE),
                   (f'{arguments.mesh.stem}, 5 % outliers', mesh, poses, OUTLIERS)]
-    table('share of the missing surface that is seen; angles in degrees', [
-        row(name, mesh, poses, side, arguments.left_out, noise)
-        for name, mesh, poses, noise in scans for side in SIDES])
+    for name, mesh, poses, noise in scans:
+        table(f'{name}: share of the missing surface that is seen; angles in degrees', [
+            row(mesh, poses, side, arguments.left_out, noise) for side in SIDES])
 
 
 if __name__ == '__main__':

@@ -37,7 +37,7 @@ from visualization_msgs.msg import MarkerArray
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.io.cdr import marker_array
 from gr2t_ros.ros.isolation import isolated
-from gr2t_ros.ros.publishers import outputs_profile, triangles
+from gr2t_ros.ros.outputs import outputs_profile, triangles
 
 _PROJECT = Path(__file__).resolve().parents[1]
 _KINDS = {'Image': Image, 'CameraInfo': CameraInfo, 'TFMessage': TFMessage}

@@ -27,8 +27,9 @@ from regimes import KEPT, NEAR, Row, tsdf_mesh
 from truth import Geometry
 import tsdf
 
-from gr2t_ros.core.reconstruction import Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.view import View
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.errors import Gr2tError
 from gr2t_ros.tools.distance import Surface
 from gr2t_ros.tools.noise import Noise

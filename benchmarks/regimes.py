@@ -28,8 +28,9 @@ import tsdf
 
 from gr2t_ros.core.confidence import confidences, deviations
 from gr2t_ros.core.ray_march import rays_of
-from gr2t_ros.core.reconstruction import Keyframe, Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Keyframe, Reconstruction
 from gr2t_ros.core.view import View
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.evaluate import nause
 from gr2t_ros.tools.noise import Noise

@@ -17,10 +17,11 @@ from stages import DEPTH_MAX, VOXELS
 
 from gr2t_ros.core.blocks import BYTES_PER_BLOCK
 from gr2t_ros.core.ray_march import Rays
-from gr2t_ros.core.reconstruction import Reconstruction, Update, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction, Update
 from gr2t_ros.core.view import View
 from gr2t_ros.core.view_mesh import ViewMesh
 from gr2t_ros.core.voxel_density import VoxelDensity
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.settings import Settings
 from gr2t_ros.tools.report import peak_memory_mb
 

@@ -23,7 +23,7 @@ from visualization_msgs.msg import MarkerArray
 from gr2t_ros.errors import InputError
 from gr2t_ros.io import formats
 from gr2t_ros.ros.isolation import isolated
-from gr2t_ros.ros.publishers import outputs_profile
+from gr2t_ros.ros.outputs import outputs_profile
 
 _PATIENCE = 120.0  # s: for what takes a few on a machine that does nothing else
 _COMPILING = 900.0  # s for the kernels, where they have to be compiled beside other work

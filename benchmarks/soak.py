@@ -40,7 +40,7 @@ from visualization_msgs.msg import MarkerArray
 from gr2t_ros.errors import InputError
 from gr2t_ros.io import formats
 from gr2t_ros.ros.isolation import isolated
-from gr2t_ros.ros.publishers import outputs_profile
+from gr2t_ros.ros.outputs import outputs_profile
 
 _PROJECT = Path(__file__).resolve().parents[1]
 _SPEED = 200 / 1200  # m/s: 200 m in 20 minutes

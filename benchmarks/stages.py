@@ -13,10 +13,10 @@ import numpy as np
 import tsdf
 
 from gr2t_ros.core.ray_march import march, Rays, rays_of, stale
-from gr2t_ros.core.reconstruction import warm_up
 from gr2t_ros.core.view import View
 from gr2t_ros.core.view_mesh import view_mesh
 from gr2t_ros.core.voxel_density import VoxelDensity
+from gr2t_ros.core.warm_up import warm_up
 from gr2t_ros.settings import Settings
 
 DEPTH_MAX = 3.5  # metres

@@ -151,9 +151,12 @@ class Settings:
         choices=('turbo', 'jet', 'coolwarm', 'viridis'), live=True)
     publish_rate: float = _parameter(
         2.0, 'Meshes published per second, at most.', unit='Hz', low=0.05, high=60.0, live=True)
+    publish_views: bool = _parameter(
+        True, 'Whether there are, beside ~/fused_mesh, also the topics ~/mesh and ~/edges: each '
+        'keyframe\'s own mesh.')
     display_stride: int = _parameter(
-        4, 'The published (not the saved) meshes use every n-th ray of every n-th row.',
-        unit='px', low=1, high=64, live=True)
+        4, 'The published (not the saved) meshes of keyframes use every n-th ray of every n-th '
+        'row.', unit='px', low=1, high=64, live=True)
     shading: bool = _parameter(
         True, 'Faces of the published meshes turned away from a light are darker, since viewers '
         'do not light coloured meshes; the saved ones keep pure colours.', live=True)

@@ -18,7 +18,7 @@ from rclpy.serialization import deserialize_message
 from ros_for_tests import Isolation, LIMIT, Observer, plane_views
 from sensor_msgs.msg import Image
 
-from gr2t_ros.ros.publishers import outputs_profile
+from gr2t_ros.ros.outputs import outputs_profile
 
 COUNT = 3
 

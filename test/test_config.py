@@ -165,7 +165,12 @@ def test_displays_get_what_was_sent_before_they_started() -> None:
     displays = {
         item['Topic']['Value']: item['Topic']
         for item in content['Visualization Manager']['Displays'] if 'Topic' in item}
-    assert displays.keys() == {'/gr2t/mesh', '/gr2t/edges', '/gr2t/points'}
+    assert displays.keys() == {f'/gr2t/{name}' for name in (
+        'fused_mesh', 'mesh', 'edges', 'points', 'attention', 'next_views')}
+    enabled = [
+        item['Topic']['Value'] for item in content['Visualization Manager']['Displays']
+        if item['Enabled'] and 'Topic' in item]
+    assert enabled == ['/gr2t/fused_mesh']
     for topic in displays.values():
         assert topic['Durability Policy'] == 'Transient Local'
         assert topic['Reliability Policy'] == 'Reliable'
@@ -310,5 +315,6 @@ def test_the_foxglove_layout_shows_the_map() -> None:
 
     assert sorted(leaves(content['layout'])) == sorted(panels)
     view, = (panel for name, panel in panels.items() if name.startswith('3D!'))
-    assert all(view['topics'][topic]['visible'] for topic in ('/gr2t/mesh', '/gr2t/points'))
+    visible = [name for name, topic in view['topics'].items() if topic['visible']]
+    assert visible == ['/gr2t/fused_mesh']
     assert view['topics']['/gr2t/points']['colorField'] == 'likelihood'

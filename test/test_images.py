@@ -22,7 +22,7 @@ from ros_for_tests import Isolation, Observer
 from sensor_msgs.msg import CameraInfo, Image
 
 from gr2t_ros.ros.images import ImagePublishers, images
-from gr2t_ros.ros.publishers import outputs_profile
+from gr2t_ros.ros.outputs import outputs_profile
 from gr2t_ros.ros.timings import Timings
 
 PINHOLE = Camera(49, 36, 45.0, 44.0, 23.5, 17.0)

@@ -123,13 +123,13 @@ def test_a_map_says_where_to_go_next() -> None:
     reconstruction = Reconstruction(Settings(
         depth_bandwidth=0.003, depth_bandwidth_quadratic=0.0, voxel_size=0.006,
         keyframe_translation=0.0))
-    assert where_next(reconstruction).views == ()
+    assert where_next(reconstruction, reconstruction.fused_mesh()).views == ()
     for view in ball_views(HALF):
         reconstruction.add(view)
     reconstruction.finish()
-    found = where_next(reconstruction)
-    again = where_next(reconstruction)
-    assert len(where_next(reconstruction, count=1).views) == 1
+    found = where_next(reconstruction, reconstruction.fused_mesh())
+    again = where_next(reconstruction, reconstruction.fused_mesh())
+    assert len(where_next(reconstruction, reconstruction.fused_mesh(), count=1).views) == 1
     reconstruction.close()
     assert angle(found.views[0].T_world_camera[:3, 3], (-1, 0, 0)) < 60
     np.testing.assert_array_equal(found.points, again.points)

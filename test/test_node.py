@@ -18,7 +18,7 @@ rclpy = pytest.importorskip('rclpy', reason='ROS 2 is not installed')
 pytest.importorskip('tf2_msgs', reason='tf2_msgs is not installed')
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus  # noqa: E402
-from geometry_msgs.msg import PoseStamped  # noqa: E402
+from geometry_msgs.msg import PoseArray, PoseStamped  # noqa: E402
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue  # noqa: E402
 from rcl_interfaces.srv import (  # noqa: E402
     DescribeParameters,
@@ -35,7 +35,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_srvs.srv import SetBool, Trigger  # noqa: E402
 from visualization_msgs.msg import Marker, MarkerArray  # noqa: E402
 
-from gr2t_ros.ros.publishers import outputs_profile  # noqa: E402
+from gr2t_ros.ros.outputs import outputs_profile  # noqa: E402
 
 FRAMES = 6
 FLAT = 0.01  # m from the plane; beside a border kernels are one-sided
@@ -78,9 +78,10 @@ def test_map_from_a_played_bag(
             for kind, messages in zip((Image, CameraInfo, Image, Image, Image), images)))
 
         def reported() -> bool:
-            """Tell whether the newest status knows the last image."""
+            """Tell whether the newest status knows the last image, and the work is done."""
             array = deserialize_message(states[-1], DiagnosticArray) if states else None
-            return bool(array) and array.status[2].values[0].value == str(FRAMES)
+            return bool(array) and array.status[2].values[0].value == str(FRAMES) and all(
+                item.level == DiagnosticStatus.OK for item in array.status)
 
         observer.spin_until(reported, 'diagnostics')
         _check_diagnostics(deserialize_message(states[-1], DiagnosticArray))
@@ -88,6 +89,18 @@ def test_map_from_a_played_bag(
         markers = _markers(arrays)
         for marker in markers.values():
             _check_marker(marker)
+            assert len(marker.points) > 100
+        fused = observer.collect(MarkerArray, '/gr2t/fused_mesh', outputs_profile(10))
+        next_views = observer.collect(PoseArray, '/gr2t/next_views', outputs_profile(10))
+        attention = observer.collect(PointCloud2, '/gr2t/attention', outputs_profile(10))
+        observer.spin_until(lambda: fused and next_views and attention, 'the fused map')
+        for marker in _markers(fused).values():
+            _check_marker(marker)
+        # the plane goes on beyond the images; it is seen from above
+        array = deserialize_message(next_views[-1], PoseArray)
+        assert array.header.frame_id == 'map'
+        assert array.poses and all(pose.position.z > 0 for pose in array.poses)
+        assert deserialize_message(attention[-1], PointCloud2).width > 10
         answer = observer.call(Trigger, 'save_snapshot')
         assert answer.success, answer.message
         path = Path(answer.message.partition(': ')[0])
@@ -108,15 +121,23 @@ def test_map_from_a_played_bag(
             type=ParameterType.PARAMETER_STRING, string_value='sigma'))
         answer = observer.call(SetParameters, 'set_parameters', parameters=[by_sigma])
         assert answer.results[0].successful
-        observer.spin_until(lambda: _markers(arrays).keys() == markers.keys(), 'other colours')
-        for number, marker in _markers(arrays).items():
-            assert marker.points == markers[number].points
-            assert marker.colors != markers[number].colors
+
+        def recoloured() -> bool:
+            """Tell whether all are there again in other colours; the old ones may come first."""
+            again = _markers(arrays)
+            return again.keys() == markers.keys() and all(
+                marker.points == markers[number].points
+                and marker.colors != markers[number].colors for number, marker in again.items())
+
+        observer.spin_until(recoloured, 'other colours')
 
         arrays.clear()
+        fused.clear()
         assert observer.call(Trigger, 'reset').success
-        observer.spin_until(lambda: arrays, 'a message that deletes the markers')
-        assert deserialize_message(arrays[-1], MarkerArray).markers[0].action == Marker.DELETEALL
+        observer.spin_until(
+            lambda: all(messages and deserialize_message(
+                messages[-1], MarkerArray).markers[0].action == Marker.DELETEALL
+                for messages in (arrays, fused)), 'messages that delete the markers')
         assert not observer.call(Trigger, 'save_snapshot').success
 
         assert observer.call(SetBool, 'pause', data=True).success
@@ -146,7 +167,7 @@ def _markers(arrays: list[bytes]) -> dict[int, Marker]:
 def _check_marker(marker: Marker) -> None:
     assert (marker.action, marker.type) == (Marker.ADD, Marker.TRIANGLE_LIST)
     assert marker.header.frame_id == 'map'
-    assert len(marker.points) == len(marker.colors) > 100
+    assert len(marker.points) == len(marker.colors) > 0
     assert len(marker.points) % 3 == 0
     assert max(abs(point.z) for point in marker.points) < FLAT
     assert marker.color.a == 1.0

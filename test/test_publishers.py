@@ -18,15 +18,9 @@ from ros_for_tests import Isolation, Observer
 from sensor_msgs.msg import PointCloud2
 from visualization_msgs.msg import Marker, MarkerArray
 
-from gr2t_ros.ros import publishers
-from gr2t_ros.ros.publishers import (
-    cloud,
-    lines,
-    MapPublishers,
-    outputs_profile,
-    point_cloud,
-    triangles,
-)
+from gr2t_ros.ros import outputs
+from gr2t_ros.ros.outputs import lines, outputs_profile, triangles
+from gr2t_ros.ros.publishers import cloud, MapPublishers, point_cloud
 
 LIKELIHOOD = Colouring('likelihood', 1.0, 'turbo')
 
@@ -83,86 +77,98 @@ class Viewer:
 
 
 def test_changed_meshes_only_and_all_for_a_newcomer(observer: Observer) -> None:
-    outputs = MapPublishers(observer.node, Settings())
+    published = MapPublishers(observer.node, Settings())
     reconstruction = Map(mesh(1), mesh(2), mesh(3))
 
-    outputs.change([0, 1, 2])
-    outputs.publish(reconstruction, 'map', 0, 1)
+    published.change([0, 1, 2])
+    published.publish(reconstruction, 'map', 0, 1)
     assert reconstruction.asked == [], 'nobody listens'
 
     viewer = Viewer(observer)
-    publish_until_heard(outputs, reconstruction, observer, viewer)
+    publish_until_heard(published, reconstruction, observer, viewer)
     assert viewer.next() == {0: 3, 1: 6, 2: 9}
 
     reconstruction.asked.clear()
-    outputs.publish(reconstruction, 'map', 0, 1)
+    published.publish(reconstruction, 'map', 0, 1)
     assert reconstruction.asked == [], 'nothing changed'
 
     reconstruction.keyframes[1] = mesh(0)
-    outputs.change([1])
-    outputs.publish(reconstruction, 'map', 0, 1)
+    published.change([1])
+    published.publish(reconstruction, 'map', 0, 1)
     assert viewer.next() == {1: 0}, 'an empty mesh is deleted'
     assert reconstruction.asked == [1]
 
     late = Viewer(observer)
     assert late.next() == {0: 3, 1: 6, 2: 9}, 'transient local keeps the last messages'
     assert late.next() == {1: 0}
-    publish_until_heard(outputs, reconstruction, observer, late)
+    publish_until_heard(published, reconstruction, observer, late)
     assert late.next() == {0: 3, 1: 0, 2: 9}
 
 
 def publish_until_heard(
-    outputs: MapPublishers, reconstruction: Map, observer: Observer, viewer: Viewer
+    published: MapPublishers, reconstruction: Map, observer: Observer, viewer: Viewer
 ) -> None:
     def heard() -> bool:
-        outputs.publish(reconstruction, 'map', 0, 1)
+        published.publish(reconstruction, 'map', 0, 1)
         return bool(viewer.messages)
 
     observer.spin_until(heard, 'the publisher to see the subscriber')
 
 
 def test_large_maps_go_in_parts(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishers, '_MAX_CORNERS', 10)
-    outputs = MapPublishers(observer.node, Settings())
+    monkeypatch.setattr(outputs, '_MAX_CORNERS', 10)
+    published = MapPublishers(observer.node, Settings())
     reconstruction = Map(mesh(3), mesh(3), mesh(3))
     viewer = Viewer(observer)
-    publish_until_heard(outputs, reconstruction, observer, viewer)
+    publish_until_heard(published, reconstruction, observer, viewer)
     assert viewer.next() == {0: 9, 1: 9}
-    outputs.publish(reconstruction, 'map', 0, 1)
+    published.publish(reconstruction, 'map', 0, 1)
     assert viewer.next() == {2: 9}
 
 
 def test_colours_follow_the_scale(observer: Observer) -> None:
     """A change that one would see sends all meshes again."""
-    outputs = MapPublishers(observer.node, Settings())
+    published = MapPublishers(observer.node, Settings())
     reconstruction = Map(mesh(1), mesh(2))
     viewer = Viewer(observer)
-    publish_until_heard(outputs, reconstruction, observer, viewer)
+    publish_until_heard(published, reconstruction, observer, viewer)
     viewer.next()
     reconstruction.scale = 0.55  # of two views: of all kernels a little more than before
-    outputs.change([0])
-    outputs.publish(reconstruction, 'map', 0, 2)
+    published.change([0])
+    published.publish(reconstruction, 'map', 0, 2)
     assert viewer.next() == {0: 3}
     reconstruction.scale = 1.1
-    outputs.change([0])
-    outputs.publish(reconstruction, 'map', 0, 2)
+    published.change([0])
+    published.publish(reconstruction, 'map', 0, 2)
     assert viewer.next() == {0: 3, 1: 6}
     reconstruction.by, reconstruction.scale = 'sigma', 2.2  # as much: it is no share of the views
-    outputs.change([0])
-    outputs.publish(reconstruction, 'map', 0, 4)
+    published.change([0])
+    published.publish(reconstruction, 'map', 0, 4)
     assert viewer.next() == {0: 3}
+
+
+def test_keyframes_own_meshes_can_be_left_out(observer: Observer) -> None:
+    """Then there are no such topics, and the rest works."""
+    published = MapPublishers(observer.node, Settings(publish_views=False))
+    names = {name for name, _ in observer.node.get_publisher_names_and_types_by_node(
+        'observer', '/')}
+    assert not {'/observer/mesh', '/observer/edges'} & names
+    assert {'/observer/points', '/observer/fused_mesh'} <= names
+    published.change([0])
+    assert not published.publish(Map(mesh(1)), 'map', 0, 1)
+    published.clear('map')
 
 
 def test_edges_for_who_wants_them(observer: Observer) -> None:
     """Each line is an edge, in its likelihood's colour; they are deleted with the map."""
-    outputs = MapPublishers(observer.node, Settings())
+    published = MapPublishers(observer.node, Settings())
     strip = replace(
         mesh(2), edges=np.array([[0, 1], [2, 3]], np.int32),
         edge_likelihood=np.array([0.2, 1.0], np.float32))
     messages = observer.collect(MarkerArray, 'observer/edges', outputs_profile(10))
 
     def heard() -> bool:
-        outputs.publish(Map(strip), 'map', 0, 1)
+        published.publish(Map(strip), 'map', 0, 1)
         return bool(messages)
 
     observer.spin_until(heard, 'edges')
@@ -173,7 +179,7 @@ def test_edges_for_who_wants_them(observer: Observer) -> None:
     expected = np.repeat(colours(strip.edge_likelihood, 1.0, 'turbo'), 2, axis=0) / 255
     np.testing.assert_allclose([(c.r, c.g, c.b) for c in marker.colors], expected, atol=1e-6)
     assert 0 < marker.scale.x < 1
-    outputs.clear('map')
+    published.clear('map')
     observer.spin_until(
         lambda: deserialize_message(messages[-1], MarkerArray).markers[0].action
         == Marker.DELETEALL, 'the deletion')
@@ -224,7 +230,7 @@ def test_deviations_as_colours() -> None:
 
 
 def test_too_many_points_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(publishers, 'MAX_POINTS', 10)
+    monkeypatch.setattr('gr2t_ros.ros.publishers.MAX_POINTS', 10)
     message = point_cloud([cloud(mesh(23), 1)], 1, LIKELIHOOD)
     assert message.width == 9
     assert isinstance(message, PointCloud2)

@@ -8,7 +8,7 @@ import pytest
 from scenes_for_tests import bumpy_views, looking_at_origin, plane_view, pose, sphere_view
 
 from gr2t_ros.core.camera import Camera
-from gr2t_ros.core.reconstruction import Reconstruction, warm_up
+from gr2t_ros.core.reconstruction import Reconstruction
 from gr2t_ros.core.view import View
 from gr2t_ros.errors import FrameError
 from gr2t_ros.settings import Settings
@@ -145,8 +145,3 @@ def test_an_image_without_any_depth_is_survived():
     reconstruction, updates = run([empty, view])
     assert updates[0].marched == 0 and updates[1].converged > 0
     assert len(dict(reconstruction.meshes())[0].vertices) == 0
-
-
-def test_warming_up_leaves_nothing_to_compile():
-    assert warm_up(SETTINGS) >= 0
-    assert warm_up(SETTINGS.updated({'start': 'observed', 'keyframe_rotation': 1.0})) < 5

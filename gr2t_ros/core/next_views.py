@@ -13,11 +13,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
+from .fused_mesh import SurfaceMesh
 from .reconstruction import Reconstruction
 from .seen_space import seen_images, SeenImage, Space, spaces
 
@@ -31,7 +33,8 @@ _TOLERANCE = 1.0  # cells between a depth and a place that is a surface
 _SILENCE = 8  # cameras that have a place hidden, for one that has no depth there
 _DOUBTFUL = 0.5  # confidence: sigma is h3, one pixel alone is as good
 _BEYOND = 0.25  # what counts that no camera had in its image: each scan has to end somewhere
-_UNUSUAL = 0.5  # what a view counts from lower or higher than the cameras ever were
+_MARGIN = 0.1  # of the distance, beyond the heights that cameras were at
+_UNUSUAL = 0.25  # what a view counts from lower or higher than the cameras ever were
 _GRAZING = 0.2  # cosine; what is seen more slantwise is not measured
 _LEAST = 0.05  # of the first view's gain, for another view
 _TILTS = 6  # views about the one that looks straight at it
@@ -89,13 +92,15 @@ class _Targets:
     confidence: Floats
 
 
-def where_next(reconstruction: Reconstruction, count: int = 5) -> Attention:
+def where_next(
+    reconstruction: Reconstruction, mesh: SurfaceMesh, count: int = 5
+) -> Attention:
     """
     Return what is missing of a map, and from where to look at it.
 
+    :param mesh: its fused mesh
     :param count: of views, at most
     """
-    mesh = reconstruction.fused_mesh()
     return attention(
         mesh.vertices, mesh.faces, mesh.vertex_confidence, seen_images(reconstruction),
         reconstruction.settings.depth_min, count)
@@ -118,14 +123,16 @@ def attention(
     nothing = Attention(np.zeros((0, 3)), np.zeros(0, np.float32), ())
     if len(faces) == 0 or len(images) == 0:
         return nothing
-    corners = vertices[faces]
-    grid = _Grid(corners.reshape(-1, 3))
+    used = np.zeros(len(vertices), np.bool_)
+    used[faces] = True
+    points = vertices[used]
+    grid = _Grid(points)
     occupied = np.zeros(grid.shape, np.bool_)
-    for points in (corners[:, 0], corners[:, 1], corners[:, 2], corners.mean(axis=1)):
-        occupied.reshape(-1)[grid.indices(points)] = True
+    for places in (points, _middles(vertices, faces)):
+        occupied.reshape(-1)[grid.indices(places)] = True
     targets = _joined(
         _missing(grid, occupied, images),
-        _doubtful(grid, corners, confidence[faces].mean(axis=1)))
+        _doubtful(grid, vertices, faces, confidence))
     if len(targets.areas) == 0:
         return nothing
     surface = grid.centres(np.argwhere(occupied))
@@ -200,9 +207,20 @@ def _missing(
         np.where(beyond, _BEYOND, 1.0), np.zeros(len(cells), np.float32))
 
 
-def _doubtful(grid: _Grid, corners: Doubles, confidence: Floats) -> _Targets:
+def _middles(values: NDArray[Any], faces: NDArray[np.int32]) -> NDArray[Any]:
+    """Return the means of the faces' three corners."""
+    middles: NDArray[Any] = (
+        values[faces[:, 0]] + values[faces[:, 1]] + values[faces[:, 2]]) / values.dtype.type(3)
+    return middles
+
+
+def _doubtful(
+    grid: _Grid, vertices: Doubles, faces: NDArray[np.int32], confidence: Floats
+) -> _Targets:
     """Return the surface of little confidence, put together cell by cell."""
-    corners, confidence = corners[confidence < _DOUBTFUL], confidence[confidence < _DOUBTFUL]
+    confidence = _middles(confidence, faces)
+    doubtful = confidence < _DOUBTFUL
+    corners, confidence = vertices[faces[doubtful]], confidence[doubtful]
     normals = 0.5 * np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = np.linalg.norm(normals, axis=1)
     centres = corners.mean(axis=1)
@@ -240,22 +258,38 @@ def _candidates(
     depths = np.concatenate([image.depth[np.isfinite(image.depth)] for image in images])
     distance = max(float(np.median(depths)) if len(depths) else 0.0, 2 * depth_min)
     eyes = np.stack([image.T_world_camera[:3, 3] for image in images])
-    up = -np.mean([image.T_world_camera[:3, 1] for image in images], axis=0)
+    up = _upwards(np.stack([image.T_world_camera for image in images]))
     places, poses = [], []
     for centre, normal in _clusters(targets, distance / 3):
         for direction in _directions(normal):
             for away in (distance, 0.6 * distance):
                 places.append(centre + away * direction)
                 poses.append(_looking(centre + away * direction, -direction, up))
+    if not places:
+        return np.zeros((0, 4, 4)), np.zeros(0)
     # where a camera shall stand, one that had no depth there is not believed against others
     space = spaces(np.array(places), images, 2 * side, 1)
     worth = np.choose(space, [0.5, 0.0, 0.0, 1.0])
     worth[_nearest(np.array(places), eyes) < 0.5 * distance] = 1.0
-    heights, margin = eyes @ up, 0.25 * distance * np.linalg.norm(up)
+    heights, margin = eyes @ up, _MARGIN * distance
     height = np.array(places) @ up
     worth[(height < heights.min() - margin) | (height > heights.max() + margin)] *= _UNUSUAL
     worth[_nearest(np.array(places), surface) < depth_min + side] = 0.0
     return np.array(poses)[worth > 0], worth[worth > 0]
+
+
+def _upwards(poses: Doubles) -> Doubles:
+    """
+    Return the direction (3,) that cameras (n, 4, 4) mostly have above them.
+
+    It is at right angles to their x axes, whichever way they look; where these are all alike it is
+    the mean of their y axes' opposites.
+    """
+    above = -poses[:, :3, 1].mean(axis=0)
+    rights = poses[:, :3, 0]
+    _, axes = np.linalg.eigh(rights.T @ rights / len(poses) - 0.01 * np.outer(above, above))
+    up: Doubles = axes[:, 0] if axes[:, 0] @ above > 0 else -axes[:, 0]
+    return up
 
 
 def _clusters(targets: _Targets, size: float) -> list[tuple[Doubles, Doubles]]:

@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import remove_ros_args
 
 from ..core.compiled import cache_notice
-from ..core.reconstruction import warm_up
+from ..core.warm_up import warm_up
 from ..errors import InputError
 from .diagnostics import Diagnostics
 from .parameters import changed, read_parameters, table, typed

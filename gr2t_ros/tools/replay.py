@@ -45,7 +45,7 @@ _PARTS = 'parts'  # folder of what left memory
 # parameters of no effect here
 _LIVE = ('max_wait_for_pose', 'cameras', 'depth_transport', 'input_qos', 'use_mask',
          'reset_on_time_jump', 'queue_size',
-         'publish_rate', 'display_stride',
+         'publish_rate', 'publish_views', 'display_stride',
          'snapshot_directory', 'snapshot_period', 'snapshot_on_exit', 'map_period', 'map_file')
 
 

@@ -11,7 +11,8 @@ from time import perf_counter
 from ..core.colour import Colouring
 from ..core.compiled import cache_notice
 from ..core.next_views import where_next
-from ..core.reconstruction import Reconstruction, Update, warm_up
+from ..core.reconstruction import Reconstruction, Update
+from ..core.warm_up import warm_up
 from ..errors import InputError
 from ..io import ply, trajectory
 from ..io.map_file import MapFile, save_map
@@ -129,7 +130,7 @@ def write_results(
     if with_map:
         saved = save_map(directory / MAP_NAME, reconstruction, run.settings.world_frame)
         results[str(saved.path)] = saved.content
-    run.next_views = where_next(reconstruction).views
+    run.next_views = where_next(reconstruction, mesh).views
     run.finish_seconds += perf_counter() - begin
     content = report.report(
         run, {'vertices': written.vertices, 'faces': written.faces}, mesh.vertex_likelihood)
