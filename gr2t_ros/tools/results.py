@@ -102,7 +102,7 @@ def write_results(
     :raises Gr2tError: if a file cannot be written
     """
     begin = perf_counter()
-    say(f'writing {directory} ...')
+    say(f'fusing {reconstruction.kept} keyframes, and writing {directory} ...')
     colouring = reconstruction.colouring()
     started = perf_counter()
     mesh = reconstruction.fused_mesh()
