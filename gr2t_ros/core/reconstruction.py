@@ -283,7 +283,7 @@ class Reconstruction:
     def restore(self, density: Density, keyframes: list[Keyframe], stamp_ns: int) -> None:
         """Become what another reconstruction was when it was saved; see state.py."""
         self._density, self.keyframes, self.stamp_ns = density, keyframes, stamp_ns
-        self._fused = FusedMap()
+        self.fused = FusedMap()
 
     def close(self) -> None:
         """End the threads."""
