@@ -3,7 +3,7 @@
 """
 Accuracy and confidence under several kinds of noise: 12 simulated views of a mesh.
 
-    python benchmarks/regimes.py bunny.ply [--exact] [--only NOISE ...] [--json out.json]
+    python benchmarks/regimes.py bunny.ply [--exact] [--only NOISE ...] [--oracle 6] [--scale 0.7]
 
 Beside it, where it is installed, Open3D's TSDF of the same images with the same voxels, truncation
 4 voxels, weight >= 3. docs/results.md says what the columns mean.
@@ -13,7 +13,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import json
 from pathlib import Path
 from time import thread_time
@@ -92,6 +92,7 @@ class Found:
 
     :param error: (n,) distance to the surface, metres
     :param along: (n,) error along the ray, metres; NaN where the ray hits nothing
+    :param ray: (n,) a number of its own for each pixel of each view
     """
 
     def __init__(self, reconstruction: Reconstruction, truth: Truth) -> None:
@@ -103,9 +104,10 @@ class Found:
             sigma = deviations(density, rays, which)
             true = truth.depth(keyframe.view).reshape(-1)[rays.pixels[which]]
             parts.append((
+                len(parts) * rays.table.size + rays.pixels[which].astype(np.int64),
                 truth.surface.distances(rays.points(which)), rays.depth[which] - true,
                 rays.total[which], sigma, confidences(sigma, density.h3(rays.depth[which]))))
-        self.error, self.along, self.likelihood, self.sigma, self.confidence = (
+        self.ray, self.error, self.along, self.likelihood, self.sigma, self.confidence = (
             np.concatenate(column) for column in zip(*parts))
 
 
@@ -156,6 +158,41 @@ def confidence(name: str, start: str, found: Found, regime: Regime, least: float
         rms = float(np.sqrt(np.mean(along[part] ** 2)))
         tenths[f'{10 * n} %'] = rms / float(sigma[part].mean())
     return row, tenths
+
+
+def oracle(
+    name: str, found: Found, mesh: trimesh.Trimesh, truth: Truth, regime: Regime,
+    seeds: Sequence[int],
+) -> Row:
+    """
+    Return what cannot be known: NAUSE of the errors of the same rays with other noise.
+
+    Also, as medians over the rays, the mean of their errors along themselves and their scatter.
+    """
+    size = int(found.ray.max()) + 1
+    squares, counts, along, along_squares = np.zeros((4, size))
+    for seed in seeds:
+        with closing(reconstructed(
+                regime.views(mesh, seed), regime.settings())) as reconstruction:
+            other = Found(reconstruction, truth)
+        # what lies on another surface is an outlier
+        there = np.flatnonzero((other.ray < size) & (np.abs(other.along) < _JUMP * regime.h3))
+        rays = other.ray[there]
+        counts[rays] += 1
+        squares[rays] += other.error[there] ** 2
+        along[rays] += other.along[there]
+        along_squares[rays] += other.along[there] ** 2
+    known = counts[found.ray] >= max(len(seeds) / 2, 2)
+    rays = found.ray[known]
+    count = counts[rays]
+    mean = along[rays] / count
+    scatter = np.sqrt(np.maximum(along_squares[rays] / count - mean ** 2, 0) * count / (count - 1))
+    return {
+        'noise': name, 'other seeds': len(seeds),
+        'NAUSE of their errors': nause(found.error[known], -np.sqrt(squares[rays] / count)),
+        'NAUSE of sigma': nause(found.error[known], -found.sigma[known]),
+        'mean error along, mm': 1e3 * float(np.median(np.abs(mean))),
+        'scatter, mm': 1e3 * float(np.median(scatter))}
 
 
 def edges(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regime) -> Row:
@@ -238,14 +275,14 @@ def starts(name: str, reconstruction: Reconstruction, truth: Truth, regime: Regi
         far = np.flatnonzero(off > 5 * unit)
         outliers += len(far)
         found = far[rays.converged[far]]
-        back += int(np.sum(truth.surface.distances(rays.points(found)) <= NEAR))
+        back += int(np.sum(truth.surface.distances(rays.points(found)) <= unit))
         along += int(np.sum(ended[far] < close))
         inlier = off < 3 * unit
         others += int(inlier.sum())
         moved += int(np.sum(inlier & (rays.start != observed) & (ended > 5 * unit)))
     return {
         'noise': name, 'outliers': outliers,
-        'end within 1 mm of the surface %': _percent(back, outliers),
+        'end within 1 mm or sigma of the surface %': _percent(back, outliers),
         'along the ray within 2 sigma %': _percent(along, outliers),
         'inliers': others, 'moved to another surface %': _percent(moved, others),
         'start, ns a ray': 1e9 * (seconds['robust'] - seconds['observed']) / sum(
@@ -266,9 +303,17 @@ def main() -> None:
     parser.add_argument('mesh', type=Path, help='the true surface, metres')
     parser.add_argument('--exact', action='store_true', help='also the exact density')
     parser.add_argument('--only', nargs='+', choices=REGIMES, default=list(REGIMES))
+    parser.add_argument(
+        '--scale', type=float, default=1.0, help='of h3 and the voxels, the TSDF\'s too (1)')
+    parser.add_argument(
+        '-p', metavar='NAME:=VALUE', action='append', default=[], help='a parameter of ours')
     parser.add_argument('--seed', type=int, default=0, help='of the noise (0)')
+    parser.add_argument(
+        '--oracle', metavar='SEEDS', type=int, default=0,
+        help='also how well the errors with so many other seeds order those with this one')
     parser.add_argument('--json', metavar='FILE', help='also write the figures there')
     arguments = parser.parse_args()
+    changes = dict(change.split(':=', 1) for change in arguments.p)
     mesh = load_mesh(arguments.mesh)
     about = machine()
     print(f'{about["processor"]}, {about["cores"]} cores, Python {about["python"]}, load '
@@ -277,15 +322,17 @@ def main() -> None:
         print('Open3D is not installed: no TSDF')
     tables: dict[str, list[Row]] = {title: [] for title in (
         'distance to the truth, mm', 'scores', 'rms error / mean sigma, tenths by sigma', 'edges',
-        'starts')}
-    distances, scores, tenths, cut, begun = tables.values()
+        'starts', 'oracle')}
+    distances, scores, tenths, cut, begun, ideal = tables.values()
     for name in arguments.only:
         regime = REGIMES[name]
+        regime = replace(
+            regime, h3=arguments.scale * regime.h3, voxel_size=arguments.scale * regime.voxel_size)
         views = regime.views(mesh, arguments.seed)
         truth = Truth(mesh, views)
         ours: list[Row] = []
         for density in ('voxel', 'exact') if arguments.exact else ('voxel',):
-            settings = regime.settings(density=density)
+            settings = regime.settings(**changes, density=density)
             warm_up(settings)
             with closing(reconstructed(views, settings)) as reconstruction:
                 meshes = [one for _, one in reconstruction.meshes()]
@@ -296,19 +343,17 @@ def main() -> None:
                     accuracy(name, f'{density}, best', best(whole, score), truth)]
                 if density == 'exact':
                     continue
-                one = reconstruction.fused_mesh()
-                whole = Geometry(one.vertices, one.faces)
-                ours += [
-                    accuracy(name, 'fused', whole, truth),
-                    accuracy(name, 'fused, best', best(whole, one.vertex_confidence), truth)]
-                row, tenth = confidence(
-                    name, 'robust', Found(reconstruction, truth), regime, settings.min_confidence)
+                found = Found(reconstruction, truth)
+                row, tenth = confidence(name, 'robust', found, regime, settings.min_confidence)
                 scores.append(row)
                 tenths.append(tenth)
                 cut.append(edges(name, reconstruction, truth, regime))
                 begun.append(starts(name, reconstruction, truth, regime))
+            if arguments.oracle:
+                ideal.append(oracle(name, found, mesh, truth, regime, [
+                    arguments.seed + 1 + n for n in range(arguments.oracle)]))
         with closing(reconstructed(
-                views, regime.settings(start='observed'))) as reconstruction:
+                views, regime.settings(**changes, start='observed'))) as reconstruction:
             row, tenth = confidence(
                 name, 'observed', Found(reconstruction, truth), regime, settings.min_confidence)
             scores.append(row)
@@ -324,7 +369,8 @@ def main() -> None:
             ours += [row | {'/ TSDF': None} for row in rows]
         distances += ours
     for title, rows in tables.items():
-        table(title, rows)
+        if rows:
+            table(title, rows)
     if arguments.json:
         with open(arguments.json, 'w', encoding='utf-8') as file:
             json.dump({'machine': about} | tables, file, indent=1)

@@ -77,8 +77,18 @@ def test_a_lone_pixel_has_no_confidence(kind):
     confidence = confidences(sigma, np.full(len(sigma), H3))
     alone = np.isin(rays.pixels[which], [v * WIDTH + u for v, u in places])
     assert alone.sum() == 3
-    assert (confidence[alone] < 0.08).all()
+    assert (confidence[alone] < 0.01).all()
     assert (confidence[~alone] > 0.5).all()
+
+
+@pytest.mark.parametrize('kind', ['exact', 'voxel'])
+def test_what_kernels_round_is_less_sure_however_many_views_see_it(kind):
+    waves = 3 * H3 * np.cos(2 * np.pi * np.arange(WIDTH) / 8).astype(np.float32)
+    views = [View(view.depth + waves, CAMERA, np.eye(4), i)
+             for i, view in enumerate(plane_views(9))]
+    _, _, sigma = found(density_of(views, kind), views[0])
+    _, _, flat = found(density_of(plane_views(9), kind), plane_views(1)[0])
+    assert sigma.mean() > 5 * flat.mean()
 
 
 def test_confidence_is_a_half_at_h3_and_0_where_nothing_is_known():
