@@ -260,6 +260,9 @@ def test_a_map_outlives_a_node_that_is_killed(
         observer.spin_until(
             lambda: f'{FRAMES} views' in observer.call(Trigger, 'save_map').message, 'all views')
         node.stop(signal.SIGKILL)
+    # a service of the dead would take the question, and never answer
+    observer.spin_until(
+        lambda: 'gr2t' not in observer.node.get_node_names(), 'the dead node to be forgotten')
     path, = node.snapshots.glob('*.gr2t')
     with NodeProcess(isolation, tmp_path, '-p', 'publish_rate:=10.0') as node:
         answer = observer.call(Trigger, 'load_map')
