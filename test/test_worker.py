@@ -351,7 +351,7 @@ def test_frames_are_refused_where_nothing_can_leave_memory(
     rig.feed()
     rig.wait(lambda: rig.dropped.get('memory') == WALL - 9, 'the others to be refused')
     assert rig.integrated == 9
-    assert 'cannot write to' in rig.worker.explanations['memory']
+    assert 'cannot write to' in rig.worker.intake.cameras[''].explanations['memory']
     assert rig.said('[memory: said once, then counted]') == 1
 
 

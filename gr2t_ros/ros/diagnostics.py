@@ -62,7 +62,7 @@ class Diagnostics:
         before = self._drops.get(name, {})
         self._drops[name] = dropped
         new = [reason for reason, count in dropped.items() if count > before.get(reason, 0)]
-        explained = {**camera.explanations, **self._worker.explanations}
+        explained = camera.explanations
         level, text = DiagnosticStatus.OK, 'images come into the map'
         if worth := [reason for reason in new if reason not in ('paused', 'reset')]:
             level = DiagnosticStatus.WARN

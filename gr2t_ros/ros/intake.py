@@ -31,7 +31,7 @@ class CameraIntake:
 
     received: images that came. integrated: those in the map. queued: those that wait for the
     worker. lost: those that were dropped before or after the assembler, by reason. refused:
-    sentences on those that were too large to be queued.
+    sentences on these.
     """
 
     assembler: FrameAssembler
@@ -167,10 +167,13 @@ class Intake:
         with self._lock:
             self._paused = paused
 
-    def drop(self, view: View, reason: str) -> None:
-        """Count a view that did not come into the map."""
+    def drop(self, view: View, reason: str, sentence: str = '') -> None:
+        """Count a view that did not come into the map; the sentence is among the news once."""
+        camera = self.cameras[view.camera_name]
         with self._lock:
-            self.cameras[view.camera_name].lost[reason] += 1
+            camera.lost[reason] += 1
+            if sentence:
+                camera.refused[reason] = sentence
 
     def drop_images(self, reason: str) -> None:
         """Drop the images that wait for the worker."""

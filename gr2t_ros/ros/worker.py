@@ -89,7 +89,6 @@ class Worker:
             settings, rectified, self._notify, self.timings, self._time_jumped)
         self._now_ns = now_ns
         self.busy = 0.0  # s
-        self.explanations: dict[str, str] = {}  # of drops by the worker itself
         self._in_a_row: Counter[str] = Counter()  # failures of one kind after the other
         self._failure = ''
         self._unseen: list[int] = []  # stamps of views that were not published yet
@@ -106,7 +105,7 @@ class Worker:
         self._stop = False
         self._thread = threading.Thread(target=self._run, name='worker')
         self.saver = Saver(settings, self, self._empty, log, self.timings)
-        self._told: set[str] = set()
+        self._told: set[str] = set()  # places of failures
 
     def start(self) -> None:
         """Begin."""
@@ -289,6 +288,8 @@ class Worker:
                     self._in_a_row[kind] = 0
                 except Exception as error:  # the thread must outlive whatever one step does
                     self._fail(kind, f'the worker\'s {kind}', error)
+            for sentence in self.intake.news():
+                self._log.warning(sentence)
             self.busy += time.perf_counter() - began
         self.saver.last(self._this(self._reconstruction))
         self._reconstruction.close()
@@ -319,8 +320,6 @@ class Worker:
 
     def _take(self) -> None:
         self._views.extend(self.intake.take())
-        for sentence in self.intake.news():
-            self._log.warning(sentence)
 
     def _time_jumped(self, stamp_ns: int) -> None:
         emptied = self._settings.reset_on_time_jump
@@ -335,13 +334,11 @@ class Worker:
         try:
             update = self._reconstruction.add(view, self.intake.load)
         except FrameError as error:
-            self.intake.drop(view, error.reason)
-            self._tell(error.reason, str(error))
+            self.intake.drop(view, error.reason, str(error))
             self._account(self._reconstruction.finish(0.0))  # some may have been released
             return
         except Exception as error:  # costs this frame, not the others
-            self.intake.drop(view, 'error')
-            self.explanations['error'] = 'a frame failed: the log says where'
+            self.intake.drop(view, 'error', 'a frame failed: the log says where')
             self._fail('frames', f'the frame of {poses.seconds(view.stamp_ns)}', error)
             return
         self._in_a_row['frames'] = 0
@@ -397,12 +394,6 @@ class Worker:
         self._number += 1
         if self.intake.world.frame:
             self._outputs.clear(self.intake.world.frame)
-
-    def _tell(self, reason: str, sentence: str) -> None:
-        self.explanations[reason] = sentence
-        if reason not in self._told:
-            self._told.add(reason)
-            self._log.warning(f'{sentence} [{reason}: said once, then counted]')
 
     def _fail(self, kind: str, what: str, error: Exception) -> None:
         self._in_a_row[kind] += 1
