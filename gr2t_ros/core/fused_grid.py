@@ -21,7 +21,7 @@ from .blocks import find, place_of, SIDE, VOXELS, with_keys
 from .camera import project_jet
 from .climb import h3_at
 from .compiled import uncounted
-from .fused_view import AGREEMENT, Bandwidth, FusedView, JUMP, REACH, TILE
+from .fused_view import Bandwidth, CERTAIN, FusedView, JUMP, REACH, TILE
 from .view import View
 
 Doubles = NDArray[np.float64]
@@ -32,7 +32,7 @@ _NEAR = 3.0
 _MIN_COSINE = 0.05
 # a view's weight is 1 at most, its distance some voxels: thousands of views fit into 31 bits
 WEIGHT, DISTANCE = 1 << 17, 1 << 14
-_AGREEMENT = 0xFFFF  # of the word behind a PIXEL's depth
+_PIXEL_WEIGHT = 0xFFFF  # of the word behind a PIXEL's depth
 
 
 class Grid(NamedTuple):
@@ -179,12 +179,12 @@ def said(
     middle = np.float64(float_at(nearest))
     h3 = h3_at(bandwidth, middle)
     width_here = max(h3, sigma[2])
-    if abs(middle - z) > REACH * width_here or word_at(nearest + 4) & _AGREEMENT == 0:
+    if abs(middle - z) > REACH * width_here or word_at(nearest + 4) & _PIXEL_WEIGHT == 0:
         return nothing
     jump = JUMP * h3
     u0, v0 = int(u + 1.0) - 1, int(v + 1.0) - 1
     right, below = u - u0, v - v0
-    total, depth, agreement, cosine, confidence = 0.0, 0.0, 0.0, 0.0, 0.0
+    total, depth, certainty, cosine, confidence = 0.0, 0.0, 0.0, 0.0, 0.0
     for n in range(4):
         row, column = v0 + (n >> 1), u0 + (n & 1)
         share = (right if n & 1 else 1.0 - right) * (below if n >> 1 else 1.0 - below)
@@ -193,11 +193,11 @@ def said(
         pixel = pixels + 8 * (row * width + column)
         there, word = float_at(pixel), word_at(pixel + 4)
         # those that lie on another surface do not count
-        if word & _AGREEMENT == 0 or not abs(there - middle) <= jump:
+        if word & _PIXEL_WEIGHT == 0 or not abs(there - middle) <= jump:
             continue
         total += share
         depth += share * there
-        agreement += share * (word & _AGREEMENT)
+        certainty += share * (word & _PIXEL_WEIGHT)
         cosine += share * (word >> 16 & 255)
         confidence += share * (word >> 24)
     inverse = 1.0 / total
@@ -206,7 +206,7 @@ def said(
     if not (cosine >= _MIN_COSINE and abs(across) <= _NEAR * width_here):
         return nothing
     part = across / width_here
-    weight = agreement * inverse / AGREEMENT * cosine * cosine * exp(-0.5 * part * part)
+    weight = certainty * inverse / CERTAIN * cosine * cosine * exp(-0.5 * part * part)
     return weight, across, h3, cosine, confidence * inverse / 255
 
 

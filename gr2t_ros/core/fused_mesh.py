@@ -3,9 +3,9 @@
 """
 One mesh out of all keyframes.
 
-Every keyframe's maxima are a depth image without noise. On a grid about them, each voxel averages
-its distances to the keyframes' surfaces, weighted by how well the maxima agree with the views and
-how much they face their camera; the mesh is where the average is zero.
+Every keyframe's maxima are a depth image with little noise. On a grid about them, each voxel
+averages its distances to the keyframes' surfaces, weighted by how sure the maxima are and how much
+they face their camera; the mesh is where the average is zero.
 """
 from __future__ import annotations
 

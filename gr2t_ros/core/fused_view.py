@@ -29,12 +29,13 @@ Bandwidth = tuple[float, float, float]
 
 # A pixel of such an image:
 #   depth       of the maximum along the camera's axis, metres
-#   agreement   in steps of 1 / AGREEMENT; 0: there is no maximum, or it does not count
+#   weight      (h3 / sigma)^2, at most 1, in steps of 1 / CERTAIN; 0: there is no maximum, or it
+#               does not count
 #   frontality  the cosine between the ray and the surface's normal, in steps of 1 / 255
 #   confidence  in steps of 1 / 255
 PIXEL = np.dtype([
-    ('depth', 'f4'), ('agreement', 'u2'), ('frontality', 'u1'), ('confidence', 'u1')])
-AGREEMENT = 65535
+    ('depth', 'f4'), ('weight', 'u2'), ('frontality', 'u1'), ('confidence', 'u1')])
+CERTAIN = 65535
 _MIN_AGREEMENT = 0.05  # less is what an outlier has
 JUMP = 4.0  # h3 between neighbours that lie on different surfaces
 TILE = 4  # pixels; side of the squares whose depths are known
@@ -146,7 +147,8 @@ def _enter(
         changed[v, u] = 1
         pixel['depth'] = depth[n]
         counts = agreement[n] >= _MIN_AGREEMENT
-        pixel['agreement'] = int(min(agreement[n], 1) * AGREEMENT) if counts else 0
+        ratio = confidence[n] / max(1.0 - confidence[n], 1e-3)  # h3 / sigma
+        pixel['weight'] = int(min(ratio * ratio, 1.0) * CERTAIN) if counts else 0
         pixel['confidence'] = int(255 * confidence[n] + 0.5)
 
 
@@ -158,7 +160,7 @@ def _turn(
     """Compute the frontality in some rows where a pixel or a neighbour has changed."""
     for v in range(first, end):
         for u in range(pixels.shape[1]):
-            if pixels[v, u]['agreement'] == 0 or changed[v, u] == 0:
+            if pixels[v, u]['weight'] == 0 or changed[v, u] == 0:
                 continue
             pixels[v, u]['frontality'] = int(
                 255 * _frontality(pixels, table, bandwidth, v, u) + 0.5)
@@ -187,10 +189,10 @@ def _slope(
     height, width = pixels.shape
     depth = pixels[v, u]['depth']
     v0, u0, v1, u1 = v - down, u - across, v + down, u + across
-    if v0 < 0 or u0 < 0 or pixels[v0, u0]['agreement'] == 0 or not (
+    if v0 < 0 or u0 < 0 or pixels[v0, u0]['weight'] == 0 or not (
             abs(pixels[v0, u0]['depth'] - depth) <= most):
         v0, u0 = v, u
-    if v1 >= height or u1 >= width or pixels[v1, u1]['agreement'] == 0 or not (
+    if v1 >= height or u1 >= width or pixels[v1, u1]['weight'] == 0 or not (
             abs(pixels[v1, u1]['depth'] - depth) <= most):
         v1, u1 = v, u
     z0, z1 = pixels[v0, u0]['depth'], pixels[v1, u1]['depth']
@@ -206,7 +208,7 @@ def _measure(pixels: NDArray[np.void], tiles: Floats, first: int, end: int) -> N
     some[:, :, 0], some[:, :, 1] = np.inf, -np.inf
     for v in range(first, end):
         for u in range(pixels.shape[1]):
-            if pixels[v, u]['agreement'] > 0:
+            if pixels[v, u]['weight'] > 0:
                 tile = tiles[v // TILE, u // TILE]
                 depth = pixels[v, u]['depth']
                 tile[0], tile[1] = min(tile[0], depth), max(tile[1], depth)
@@ -237,10 +239,10 @@ def _keys(
             near, far = np.inf, -np.inf
             for v in range(max(v0 - _HALO, 0), min(v1 + _HALO, height)):
                 for u in range(max(u0 - _HALO, 0), min(u1 + _HALO, width)):
-                    if pixels[v, u]['agreement'] > 0:
+                    if pixels[v, u]['weight'] > 0:
                         depth = pixels[v, u]['depth']
                         near, far = min(near, depth), max(far, depth)
-                    if before[v, u]['agreement'] > 0:
+                    if before[v, u]['weight'] > 0:
                         depth = before[v, u]['depth']
                         near, far = min(near, depth), max(far, depth)
             if far < near:
@@ -288,7 +290,7 @@ def _mask(
         for u in range(max(u0 - _HALO, 0), min(u1 + _HALO, width)):
             for n in range(2):
                 pixel = pixels[v, u] if n == 0 else before[v, u]
-                if pixel['agreement'] == 0:
+                if pixel['weight'] == 0:
                     continue
                 depth = pixel['depth']
                 reach = REACH * h3_at(sigma, depth)
