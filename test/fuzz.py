@@ -267,6 +267,8 @@ def campaign(name: str, seconds: float, corpus: Path, kept: Path) -> tuple[int, 
             print(f'  {name}: {new[-1]}, explained in {report}', flush=True)
         elif not counts:
             raise SystemExit(f'{name} could not be fuzzed:\n{run.stderr[-2000:]}')
+        else:
+            break
     return inputs, found
 
 
@@ -291,6 +293,7 @@ def main() -> int:
             known = sorted(INPUTS.glob(f'{name}-*'))
             still = sum(crashes(name, path) for path in [*known, *found])
             rows.append((name, inputs, len(found), len(known), still))
+            print(f'{name}: {inputs} inputs, {len(found)} crashes', flush=True)
             left += still
     print(f'{"decoder":18}{"inputs tried":>14}{"crashes found":>15}{"found before":>14}'
           f'{"crashes left":>14}')
