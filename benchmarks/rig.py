@@ -16,6 +16,7 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import rclpy
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from std_srvs.srv import Trigger
 from synthetic_camera import SyntheticCamera
 from visualization_msgs.msg import MarkerArray
@@ -67,7 +68,8 @@ class Rig:
         self.flag = folder / 'fail'
         self.environment = isolated(os.environ)
         os.environ.update(self.environment)
-        rclpy.init(args=[])
+        # Ctrl-C stays Python's
+        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         self._node = rclpy.create_node('chaos')
         self._states: list[bytes] = []
         self._node.create_subscription(

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 import rclpy
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
+from rclpy.signals import SignalHandlerOptions
 from synthetic_camera import render, SyntheticCamera
 from visualization_msgs.msg import MarkerArray
 
@@ -90,7 +91,8 @@ class Soak:
                 [sys.executable, '-m', 'gr2t_ros.ros.node', '--ros-args', *arguments],
                 stdout=file, stderr=file, env=self._environment, start_new_session=True,
                 ) as process:
-            rclpy.init(args=[])
+            # Ctrl-C stays Python's
+            rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
             node = rclpy.create_node('soak')
             node.create_subscription(
                 DiagnosticArray, '/diagnostics', self._states.append, 10, raw=True)
@@ -103,12 +105,12 @@ class Soak:
                     environment=self._environment)
                 try:
                     self._watch(node, process, camera, 60 * minutes)
+                except KeyboardInterrupt:
+                    print('\nended early', flush=True)
                 finally:
                     camera.end()
                     self.sent = camera.sent
                 self._watch(node, process, None, _LAST)
-            except KeyboardInterrupt:
-                print('\nended early', flush=True)
             finally:
                 survived = process.poll() is None
                 if survived:
@@ -291,8 +293,11 @@ def main() -> int:
     results = _PROJECT / 'benchmarks' / 'results'
     results.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory(prefix='gr2t_soak_') as folder:
-        soak = Soak(Path(folder), arguments.memory, tuple(arguments.size))
-        survived = soak.run(arguments.minutes, arguments.speed)
+        try:
+            soak = Soak(Path(folder), arguments.memory, tuple(arguments.size))
+            survived = soak.run(arguments.minutes, arguments.speed)
+        except KeyboardInterrupt:  # before the first image
+            return 130
     if len(soak.samples) < 5:
         print('too short to say anything')
         return 1

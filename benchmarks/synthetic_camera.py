@@ -90,7 +90,8 @@ class SyntheticCamera:
         self.sent = 0
         self._process = subprocess.Popen(
             [sys.executable, __file__, str(frames), *arguments], env=environment, text=True,
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+            start_new_session=True)  # Ctrl-C is not for it: it ends with its input
         threading.Thread(target=self._listen, daemon=True).start()
 
     def tell(self, line: str) -> None:
