@@ -78,7 +78,7 @@ def row(
         mesh, camera, [pose for pose, is_out in zip(poses, out) if not is_out], noise=noise))
     found, seconds = suggested(views)
 
-    truth = Truth(mesh, views)
+    truth = Truth(mesh, ())  # its own samples, of what two views see, are not asked for
     samples, _ = sample_surface(mesh, SAMPLES, seed=0)
 
     def seen(pose: Pose) -> NDArray[np.bool_]:

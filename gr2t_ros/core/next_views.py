@@ -91,6 +91,10 @@ class _Targets:
     weights: Doubles
     confidence: Floats
 
+    def only(self, kept: NDArray[np.bool_]) -> _Targets:
+        """Return some of them."""
+        return _Targets(*(getattr(self, name)[kept] for name in _Targets.__dataclass_fields__))
+
 
 def where_next(
     reconstruction: Reconstruction, mesh: SurfaceMesh, count: int = 5
@@ -136,12 +140,21 @@ def attention(
     if len(targets.areas) == 0:
         return nothing
     surface = grid.centres(np.argwhere(occupied))
+
+    def cosines(poses: Doubles, of: _Targets) -> Floats:
+        seen = np.zeros((len(poses), len(of.areas)), np.float32)
+        for T, row in zip(poses, seen):
+            _look(T, images[-1].slopes, surface, grid.side, of.points, of.normals, depth_min,
+                  images[-1].depth_max, np.full((_HEIGHT, _WIDTH), np.inf), row)
+        return seen
+
+    # what a camera had before it is not missing: cells are coarse, as about an edge
+    scanned = cosines(np.stack([image.T_world_camera for image in images]), targets).any(axis=0)
+    targets = targets.only(~scanned | (targets.confidence > 0))
+    if len(targets.areas) == 0:
+        return nothing
     candidates, worth = _candidates(grid.side, surface, targets, images, depth_min)
-    gains = np.zeros((len(candidates), len(targets.areas)), np.float32)
-    slopes = images[-1].slopes
-    for T, gain in zip(candidates, gains):
-        _look(T, slopes, surface, grid.side, targets.points, targets.normals, depth_min,
-              images[-1].depth_max, np.full((_HEIGHT, _WIDTH), np.inf), gain)
+    gains = cosines(candidates, targets)
     gains *= worth[:, None] * (targets.areas * targets.weights)
     return Attention(
         targets.points, targets.confidence, _best(candidates, gains, targets, count))
