@@ -50,7 +50,7 @@ _RATE = 30.0  # Hz
 SETTINGS = {
     'voxel_size': 0.02, 'depth_bandwidth': 0.01, 'depth_max': 3.0, 'ray_stride': 4,
     'display_stride': 8}
-BESIDE_MB = 600  # the process' memory besides the map's
+BESIDE_MB = 700  # the process' memory besides the map's, where it compiles its kernels
 _FLAT = 0.10
 _LAST = 5.0  # s after the last image for what is on its way
 _PATIENCE = 900.0  # s for the kernels, where they have to be compiled beside other work

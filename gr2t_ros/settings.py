@@ -102,7 +102,7 @@ class Settings:
         unit='s', low=0.0, high=60.0, live=True)
     max_memory_mb: int = _parameter(
         0, 'Memory of the map (10^6 bytes): blocks, rays and what a snapshot makes of them; the '
-        'process takes up to 600 MB besides (gr2t replay, with its picture: 800). Where it is '
+        'process takes up to 700 MB besides (gr2t replay, with its picture: 900). Where it is '
         'full, the keyframes farthest from the camera are written out as finished PLY files and '
         'forgotten. 0: half of the machine\'s memory.',
         unit='MB', low=0, high=10_000_000, live=True)
