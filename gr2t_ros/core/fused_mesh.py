@@ -30,8 +30,9 @@ from .fused_grid import (
     views_of,
     without_empty,
 )
-from .fused_surface import surface, without_islands
+from .fused_surface import surface
 from .fused_view import Bandwidth, FusedView, spread
+from .islands import without_islands
 from .new_density import voxel_size_for
 from .ray_march import Density, Rays
 from .view import View

@@ -113,38 +113,6 @@ def used(whole: Surface) -> Surface:
         whole.outside[kept], number[whole.faces])
 
 
-def without_islands(whole: Surface, fewest: int) -> Surface:
-    """
-    Return a surface without its small parts, but for those that may go on in other blocks.
-
-    :param fewest: triangles of a part that stays
-    """
-    part = _parts(len(whole.vertices), whole.faces)
-    size = np.bincount(part[whole.faces[:, 0]], minlength=len(part))
-    size[part[whole.outside]] = fewest
-    return used(whole._replace(faces=whole.faces[size[part[whole.faces[:, 0]]] >= fewest]))
-
-
-@njit(cache=True, nogil=True)
-def _parts(count: int, faces: Ints) -> NDArray[np.int64]:
-    """Return for each vertex one that stands for all that it is connected with."""
-    parent = np.arange(count)
-    for n in range(len(faces)):
-        a, b, c = int64(faces[n, 0]), int64(faces[n, 1]), int64(faces[n, 2])
-        for other in (b, c):
-            while parent[a] != a:
-                parent[a] = parent[parent[a]]
-                a = parent[a]
-            while parent[other] != other:
-                parent[other] = parent[parent[other]]
-                other = parent[other]
-            parent[max(a, other)] = min(a, other)
-            a = min(a, other)
-    for n in range(count):
-        parent[n] = parent[parent[n]]  # smaller ones are done
-    return parent
-
-
 def _edges(grid: Grid, blocks: Ints, pool: Executor | None) -> _Edges:
     """Return the edges with a vertex, of the blocks and those that their cells reach into."""
     number = np.full(grid.size, -1, np.int32)
