@@ -15,13 +15,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
 from .fused_mesh import SurfaceMesh
 from .reconstruction import Reconstruction
 from .seen_space import seen_images, SeenImage, Space, spaces
+from .sight import look, nearest
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -35,7 +35,6 @@ _DOUBTFUL = 0.5  # confidence: sigma is h3, one pixel alone is as good
 _BEYOND = 0.25  # what counts that no camera had in its image: each scan has to end somewhere
 _MARGIN = 0.1  # of the distance, beyond the heights that cameras were at
 _UNUSUAL = 0.25  # what a view counts from lower or higher than the cameras ever were
-_GRAZING = 0.2  # cosine; what is seen more slantwise is not measured
 _LEAST = 0.05  # of the first view's gain, for another view
 _TILTS = 6  # views about the one that looks straight at it
 _TILT = 0.7  # rad
@@ -144,7 +143,7 @@ def attention(
     def cosines(poses: Doubles, of: _Targets) -> Floats:
         seen = np.zeros((len(poses), len(of.areas)), np.float32)
         for T, row in zip(poses, seen):
-            _look(T, images[-1].slopes, surface, grid.side, of.points, of.normals, depth_min,
+            look(T, images[-1].slopes, surface, grid.side, of.points, of.normals, depth_min,
                   images[-1].depth_max, np.full((_HEIGHT, _WIDTH), np.inf), row)
         return seen
 
@@ -283,11 +282,11 @@ def _candidates(
     # where a camera shall stand, one that had no depth there is not believed against others
     space = spaces(np.array(places), images, 2 * side, 1)
     worth = np.choose(space, [0.5, 0.0, 0.0, 1.0])
-    worth[_nearest(np.array(places), eyes) < 0.5 * distance] = 1.0
+    worth[nearest(np.array(places), eyes) < 0.5 * distance] = 1.0
     heights, margin = eyes @ up, _MARGIN * distance
     height = np.array(places) @ up
     worth[(height < heights.min() - margin) | (height > heights.max() + margin)] *= _UNUSUAL
-    worth[_nearest(np.array(places), surface) < depth_min + side] = 0.0
+    worth[nearest(np.array(places), surface) < depth_min + side] = 0.0
     return np.array(poses)[worth > 0], worth[worth > 0]
 
 
@@ -358,66 +357,8 @@ def _best(
         gain = gains[best].copy()
         seen = gain > 0
         middle = np.average(targets.points[seen], axis=0, weights=gain[seen])
-        nearest = np.linalg.norm(targets.points[seen] - middle, axis=1).argmin()
+        middlemost = np.linalg.norm(targets.points[seen] - middle, axis=1).argmin()
         views.append(NextView(
-            targets.points[seen][nearest], float(targets.areas[seen].sum()), candidates[best]))
+            targets.points[seen][middlemost], float(targets.areas[seen].sum()), candidates[best]))
         gains[:, seen] = 0
     return tuple(views)
-
-
-@njit(cache=True, nogil=True)
-def _nearest(points: Doubles, others: Doubles) -> Doubles:
-    """Return the distances (n,) of points to the nearest of others, metres."""
-    found = np.full(len(points), np.inf)
-    for n in range(len(points)):
-        for m in range(len(others)):
-            squared = 0.0
-            for axis in range(3):
-                squared += (points[n, axis] - others[m, axis]) ** 2
-            found[n] = min(found[n], np.sqrt(squared))
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _look(
-    T_world_camera: Pose, slopes: Doubles, surface: Doubles, side: float, points: Doubles,
-    normals: Doubles, depth_min: float, depth_max: float, nearest: Doubles, gain: Floats,
-) -> None:
-    """
-    Write what a view sees of each target: its cosine, 0 where it is not seen.
-
-    :param slopes: (2,) half the width and height of the image at a depth of 1
-    :param surface: (k, 3) float64, middles of cells that may be in the way
-    :param side: of these, metres
-    :param nearest: (h, w) float64, infinite: room for the depths of these
-    """
-    height, width = nearest.shape
-    fx, fy = 0.5 * width / slopes[0], 0.5 * height / slopes[1]
-    for k in range(len(surface)):
-        x, y, z = 0.0, 0.0, 0.0
-        for axis in range(3):
-            way = surface[k, axis] - T_world_camera[axis, 3]
-            x += way * T_world_camera[axis, 0]
-            y += way * T_world_camera[axis, 1]
-            z += way * T_world_camera[axis, 2]
-        if z < side:
-            continue
-        u, v = fx * x / z + 0.5 * width, fy * y / z + 0.5 * height
-        ru, rv = 0.5 * fx * side / z, 0.5 * fy * side / z
-        for j in range(max(int(np.floor(v - rv)), 0), min(int(np.floor(v + rv)) + 1, height)):
-            for i in range(max(int(np.floor(u - ru)), 0), min(int(np.floor(u + ru)) + 1, width)):
-                nearest[j, i] = min(nearest[j, i], z)
-    for n in range(len(points)):
-        x, y, z, towards, squared = 0.0, 0.0, 0.0, 0.0, 0.0
-        for axis in range(3):
-            way = points[n, axis] - T_world_camera[axis, 3]
-            x += way * T_world_camera[axis, 0]
-            y += way * T_world_camera[axis, 1]
-            z += way * T_world_camera[axis, 2]
-            towards -= way * normals[n, axis]
-            squared += way * way
-        if not depth_min <= z <= depth_max or towards <= _GRAZING * np.sqrt(squared):
-            continue
-        u, v = fx * x / z + 0.5 * width, fy * y / z + 0.5 * height
-        if 0 <= u < width and 0 <= v < height and z <= nearest[int(v), int(u)] + 2 * side:
-            gain[n] = towards / np.sqrt(squared)
