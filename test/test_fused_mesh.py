@@ -234,6 +234,62 @@ def test_no_face_bridges_free_space(gap):
     assert not between.any()
 
 
+BACK = ([-1, -1, 0.5], [1, 1, 0.6])
+
+
+def seen_from(xs, *boxes):
+    return [wall(CAMERA, pose([0, 0, 0], [x, 0, 0]), [BACK, *boxes]) for x in xs]
+
+
+def test_what_more_views_see_through_than_see_is_no_surface():
+    phantom_view = plane_view(CAMERA, np.eye(4), [0, 0, 1], 0.3)  # 0.2 m before the wall
+    others = [wall(CAMERA, pose([0, 0, 0], [x, 0, -0.1]), [BACK]) for x in (-0.01, 0.01)]
+    with closing(built([phantom_view, others[0]])) as reconstruction:
+        tied = reconstruction.fused_mesh()
+        before = {key: reconstruction.fused_region(key) for key in reconstruction.fused_regions}
+        reconstruction.add(others[1])
+        changed = reconstruction.fuse()
+        regions = {key: reconstruction.fused_region(key) for key in reconstruction.fused_regions}
+        mesh = reconstruction.fused_mesh()
+        del reconstruction.keyframes[2]
+        changed_back = reconstruction.fuse()
+        back = reconstruction.fused_mesh()
+    assert (abs(tied.vertices[:, 2] - 0.3) < VOXEL).sum() > 500
+    assert (mesh.vertices[:, 2] > 0.48).all()
+    phantom = {
+        key for key, region in before.items()
+        if len(region.faces) and region.vertices[:, 2].min() < 0.32}
+    assert phantom and phantom <= set(changed)
+    for key in set(regions) - set(changed):
+        assert_same(regions[key], before[key])
+    # the wall behind it, which one view does not see, stays
+    assert len(mesh.faces) > 0.9 * len(fused(others).faces)
+    batch = fused([phantom_view, *others], SETTINGS.updated({'threads': 4}))
+    assert_same(in_order(mesh), in_order(batch))
+    assert (abs(back.vertices[:, 2] - 0.3) < VOXEL).sum() > 500 and phantom <= set(changed_back)
+
+
+def test_a_patch_that_many_see_and_some_see_through_stays_until_its_keyframes_leave():
+    patch = ([-0.05, -0.05, 0.3], [0.05, 0.05, 0.31])
+    views = [*seen_from([-0.02, 0.0, 0.02], patch), *seen_from([-0.03, 0.03])]
+    with closing(built(views)) as reconstruction:
+        mesh = reconstruction.fused_mesh()
+        assert (abs(mesh.vertices[:, 2] - 0.3) < VOXEL).sum() > 50
+        del reconstruction.keyframes[:2]
+        changed = reconstruction.fuse()
+        left = reconstruction.fused_mesh()
+        here = {tuple(np.floor(point / (64 * VOXEL)).astype(int)) for point in mesh.vertices[
+            abs(mesh.vertices[:, 2] - 0.3) < VOXEL]}
+    assert (left.vertices[:, 2] > 0.48).all() and here <= set(changed)
+
+
+def test_a_thin_rod_that_all_see_stays():
+    rod = ([-0.008, -0.15, 0.29], [0.008, 0.15, 0.306])  # six pixels wide
+    mesh = fused(noisy(seen_from([-0.1, -0.05, 0.0, 0.05, 0.1], rod), 0.001))
+    front = mesh.vertices[abs(mesh.vertices[:, 2] - 0.29) < VOXEL]
+    assert np.ptp(front[:, 1]) > 0.12 and abs(front[:, 0]).max() < 0.008 + 2 * VOXEL
+
+
 def test_edges_have_two_faces_at_most_however_wild_the_surface():
     rng = np.random.default_rng(3)
     views = []

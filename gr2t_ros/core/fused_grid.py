@@ -32,7 +32,7 @@ _NEAR = 3.0
 _MIN_COSINE = 0.05
 # a view's weight is 1 at most, its distance some voxels: thousands of views fit into 31 bits
 WEIGHT, DISTANCE = 1 << 17, 1 << 14
-_PIXEL_WEIGHT = 0xFFFF  # of the word behind a PIXEL's depth
+PIXEL_WEIGHT = 0xFFFF  # of the word behind a PIXEL's depth
 
 
 class Grid(NamedTuple):
@@ -179,7 +179,7 @@ def said(
     middle = np.float64(float_at(nearest))
     h3 = h3_at(bandwidth, middle)
     width_here = max(h3, sigma[2])
-    if abs(middle - z) > REACH * width_here or word_at(nearest + 4) & _PIXEL_WEIGHT == 0:
+    if abs(middle - z) > REACH * width_here or word_at(nearest + 4) & PIXEL_WEIGHT == 0:
         return nothing
     jump = JUMP * h3
     u0, v0 = int(u + 1.0) - 1, int(v + 1.0) - 1
@@ -193,11 +193,11 @@ def said(
         pixel = pixels + 8 * (row * width + column)
         there, word = float_at(pixel), word_at(pixel + 4)
         # those that lie on another surface do not count
-        if word & _PIXEL_WEIGHT == 0 or not abs(there - middle) <= jump:
+        if word & PIXEL_WEIGHT == 0 or not abs(there - middle) <= jump:
             continue
         total += share
         depth += share * there
-        certainty += share * (word & _PIXEL_WEIGHT)
+        certainty += share * (word & PIXEL_WEIGHT)
         cosine += share * (word >> 16 & 255)
         confidence += share * (word >> 24)
     inverse = 1.0 / total
@@ -218,13 +218,15 @@ def _corner_of(part: int) -> int:
 
 @uncounted(error_model='numpy')
 def sees(
-    views: Views, view: int, sigma: Bandwidth, corners: Doubles, first: int, step: int
+    views: Views, view: int, sigma: Bandwidth, corners: Doubles, first: int, step: int,
+    through: bool,
 ) -> bool:
     """
     Tell whether a view may have something to say in a box.
 
     :param corners: (27, 4), whether they are before it, u, v, z (metres); a lattice of 3 x 3 x 3
     :param first: corner of the box; step: to the next in x; 3 and 9 of it in y and z
+    :param through: whether it counts, too, that it sees through the box
     """
     u0, u1, v0, v1, near, far = np.inf, -np.inf, np.inf, -np.inf, np.inf, -np.inf
     before, behind = 0, 0
@@ -237,7 +239,11 @@ def sees(
         before += 1
         u0, u1 = min(u0, corner[1]), max(u1, corner[1])
         v0, v1 = min(v0, corner[2]), max(v1, corner[2])
-    if far <= 0 or near > views.depth[view, 1] or far < views.depth[view, 0]:
+    if far <= 0:
+        return False
+    if through:
+        far = np.inf
+    if near > views.depth[view, 1] or far < views.depth[view, 0]:
         return False
     height, width = views.size[view, 0], views.size[view, 1]
     rows, columns = (height + TILE - 1) // TILE, (width + TILE - 1) // TILE
@@ -292,7 +298,7 @@ def _add_view(
         x, y, z = i * SIDE * voxel, j * SIDE * voxel, k * SIDE * voxel
         find_corners(views, view, x, y, z, SIDE * voxel, corners)
         for part in range(8):
-            if sees(views, view, sigma, corners, _corner_of(part), 1):
+            if sees(views, view, sigma, corners, _corner_of(part), 1, False):
                 _add(
                     grid, int64(block) * VOXELS, part, views, view, x, y, z, bandwidth, sigma,
                     voxel, sign)
@@ -350,5 +356,6 @@ def reached(
                 views, view, i * SIDE * voxel, j * SIDE * voxel, k * SIDE * voxel, SIDE * voxel,
                 corners)
             for part in range(8):
-                kept[n] = kept[n] or sees(views, view, sigma, corners, _corner_of(part), 1)
+                kept[n] = kept[n] or sees(
+                    views, view, sigma, corners, _corner_of(part), 1, False)
     return keys[kept]

@@ -35,6 +35,7 @@ from .fused_view import Bandwidth, FusedView, spread
 from .islands import without_islands
 from .new_density import voxel_size_for
 from .ray_march import Density, Rays
+from .seen_through import blocks_seen_through
 from .view import View
 from .voxel_density import VoxelDensity
 
@@ -44,7 +45,7 @@ Seen = tuple[Views, Bandwidth, Bandwidth, float]
 
 REGION = 8  # blocks; side of a region
 MIN_COMPONENT = 50  # triangles
-_BLOCKS = 128  # a task
+_BLOCKS, _MANY = 128, 4096  # a task
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +144,7 @@ class FusedMap:
             blocks = np.arange(1, self._grid.size, dtype=np.int32)
             keys = reached(new_grid(1), self._grid.key[blocks], *seen, 0)
             self._sum(seen, self._blocks_of(keys), -1, pool)
+            self._judge_anew(seen[0], density.bandwidth, pool)
         if gone:
             self._grid = without_empty(self._grid)
 
@@ -157,6 +159,20 @@ class FusedMap:
             self._sum(self._seen(density, {view: image.former}), blocks, -1, pool)
             image.former = None
         self._sum(now, blocks, 1, pool)
+        changed = now[0]._replace(
+            address=np.array([[0, image.changed.ctypes.data]]),
+            depth=np.array([[-np.inf, np.inf]]))  # as they were, too
+        self._judge_anew(changed, density.bandwidth, pool)
+
+    def _judge_anew(self, views: Views, bandwidth: Bandwidth, pool: Executor | None) -> None:
+        """Note the regions with something that a keyframe, the only one of views, sees through."""
+        sigma = spread(bandwidth, self._voxel)
+        blocks = np.arange(1, self._grid.size, dtype=np.int32)
+        through = np.concatenate([np.zeros(0, np.bool_), *run_all(pool, blocks_seen_through, [
+            (self._grid, blocks[i:i + _MANY], views, sigma, self._voxel)
+            for i in range(0, len(blocks), _MANY)])])
+        self._changed.append(np.unique(
+            _regions_of(_before(self._grid, blocks[through])), axis=0))
 
     def _blocks_of(self, keys: NDArray[np.int64]) -> NDArray[np.int32]:
         """Return the blocks with some keys, made where there are none; note that they change."""

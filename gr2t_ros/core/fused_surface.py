@@ -20,6 +20,7 @@ from .compiled import run_all, uncounted
 from .fused_grid import find_corners, Grid, moved, projected, said, sees, Views, WEIGHT
 from .fused_view import Bandwidth
 from .marching_cubes import EDGE_AXIS, EDGE_CORNER, table
+from .seen_through import sees_through
 
 Doubles = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -76,7 +77,7 @@ def surface(
     pool: Executor | None,
 ) -> Surface:
     """
-    Return the surface in the cells of some blocks.
+    Return the surface in the cells of some blocks, less what more views see through than see.
 
     :param blocks: (n,) int32
     :param sigma: see fused_view.spread
@@ -86,16 +87,17 @@ def surface(
     count = int(edges.first[-1])
     vertices = np.zeros((count, 3))
     sums = np.zeros((count, 3))
-    support = np.zeros(count, np.int32)
+    support, through = np.zeros(count, np.int32), np.zeros(count, np.int32)
     owners = range(0, len(edges.block), _BLOCKS)
     run_all(pool, _place, [
         (grid, edges, i, min(i + _BLOCKS, len(edges.block)), voxel, vertices) for i in owners])
     run_all(pool, _judge, [
         (grid, edges, i, min(i + _BLOCKS, len(edges.block)), views, bandwidth, sigma, voxel,
-         vertices, sums, support, np.zeros((27, 4))) for i in owners])
+         vertices, sums, support, through, np.zeros((27, 4))) for i in owners])
     parts = [blocks[i:i + _BLOCKS] for i in range(0, len(blocks), _BLOCKS)]
     faces = run_all(pool, _triangles, [(grid, edges, part, table()) for part in parts])
     joined = np.concatenate([np.zeros((0, 3), np.int32), *faces])
+    joined = joined[(through <= support)[joined].all(axis=1)]
     outside, within = np.zeros(count, np.bool_), np.zeros(len(edges.block), np.bool_)
     within[edges.number[blocks]] = True
     _mark_outside(grid, edges, within, outside)
@@ -319,9 +321,13 @@ def _place(
 def _judge(
     grid: Grid, edges: _Edges, first: int, end: int, views: Views, bandwidth: Bandwidth,
     sigma: Bandwidth, voxel: float, vertices: Doubles, sums: Doubles, support: Ints,
-    corners: Doubles,
+    through: Ints, corners: Doubles,
 ) -> None:
-    """Add up what the views say of the vertices of some blocks: weights, sigmas, confidences."""
+    """
+    Add up what the views say of the vertices of some blocks: weights, sigmas, confidences.
+
+    :param support: how many say something; through: how many see through the vertex
+    """
     side = SIDE * voxel
     for owner in range(first, end):
         begin, stop = edges.first[owner], edges.first[owner + 1]
@@ -330,7 +336,7 @@ def _judge(
         x, y, z = place_of(grid.key[edges.block[owner]])
         for view in range(len(views.stride)):
             find_corners(views, view, x * side, y * side, z * side, side, corners)
-            if not sees(views, view, sigma, corners, 0, 2):
+            if not sees(views, view, sigma, corners, 0, 2, True):
                 continue
             T = views.T_camera_world[view]
             for vertex in range(begin, stop):
@@ -347,6 +353,8 @@ def _judge(
                     sums[vertex, 0] += weight
                     sums[vertex, 1] += weight * along * cosine
                     sums[vertex, 2] += weight * confidence
+                elif sees_through(views, view, bandwidth, sigma, u, v, at[2]):
+                    through[vertex] += 1
 
 
 @njit(cache=True, nogil=True)

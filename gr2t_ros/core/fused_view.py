@@ -60,8 +60,10 @@ class FusedView:
     :param stride: ray_stride
 
     `pixels` is (h, w) PIXEL; `tiles` is (h / TILE, w / TILE, 2) float32, the least and the largest
-    depth in each tile, metres; (inf, -inf) where there is none; `rounds` is that of the rays when
-    they were taken in; `former` is the image as it was before the last update, where it is kept.
+    depth in each tile, metres; (inf, -inf) where there is none; `changed` is likewise, of the
+    pixels (and their neighbours) that the last update changed, as they were and as they are;
+    `rounds` is that of the rays when they were taken in; `former` is the image as it was before
+    the last update, where it is kept.
     """
 
     def __init__(self, camera: Camera, stride: int) -> None:
@@ -71,6 +73,7 @@ class FusedView:
         height, width = self._table.shape[:2]
         self.pixels = np.zeros((height, width), PIXEL)
         self.tiles = np.zeros((-(-height // TILE), -(-width // TILE), 2), np.float32)
+        self.changed = np.zeros_like(self.tiles)
         self._marches = np.zeros(0, np.uint16)
         self.former: FusedView | None = None
         self.depth = (np.inf, -np.inf)
@@ -79,7 +82,7 @@ class FusedView:
     @property
     def nbytes(self) -> int:
         """Return the memory it takes."""
-        return self.pixels.nbytes + self.tiles.nbytes + self._marches.nbytes
+        return self.pixels.nbytes + 2 * self.tiles.nbytes + self._marches.nbytes
 
     @property
     def addresses(self) -> tuple[int, int]:
@@ -124,7 +127,13 @@ class FusedView:
         rows = [(v, min(v + _ROWS, len(about))) for v in range(0, len(about), _ROWS)]
         run_all(pool, _turn, [
             (self.pixels, self._table, density.bandwidth, about, *some) for some in rows])
-        run_all(pool, _measure, [(self.pixels, self.tiles, *some) for some in rows])
+        every = np.ones_like(about)
+        for tiles, images, chosen in (
+                (self.tiles, [self.pixels], every),
+                (self.changed, [self.pixels, self.former.pixels], about)):
+            tiles[..., 0], tiles[..., 1] = np.inf, -np.inf
+            for pixels in images:
+                run_all(pool, _measure, [(pixels, chosen, tiles, *some) for some in rows])
         sigma = spread(density.bandwidth, voxel)
         near, far = float(self.tiles[..., 0].min()), float(self.tiles[..., 1].max())
         reach = REACH * h3_at(sigma, far)
@@ -202,13 +211,13 @@ def _slope(
 
 
 @njit(cache=True, nogil=True)
-def _measure(pixels: NDArray[np.void], tiles: Floats, first: int, end: int) -> None:
-    """Write the least and the largest depth of each tile in some rows."""
-    some = tiles[first // TILE:(end + TILE - 1) // TILE]
-    some[:, :, 0], some[:, :, 1] = np.inf, -np.inf
+def _measure(
+    pixels: NDArray[np.void], chosen: NDArray[np.uint8], tiles: Floats, first: int, end: int
+) -> None:
+    """Take the depths of the chosen pixels in some rows into their tiles' least and largest."""
     for v in range(first, end):
         for u in range(pixels.shape[1]):
-            if pixels[v, u]['weight'] > 0:
+            if chosen[v, u] != 0 and pixels[v, u]['weight'] > 0:
                 tile = tiles[v // TILE, u // TILE]
                 depth = pixels[v, u]['depth']
                 tile[0], tile[1] = min(tile[0], depth), max(tile[1], depth)
