@@ -343,6 +343,11 @@ def main() -> None:
                     accuracy(name, f'{density}, best', best(whole, score), truth)]
                 if density == 'exact':
                     continue
+                fused = reconstruction.fused_mesh()
+                one = Geometry(fused.vertices, fused.faces)
+                ours += [
+                    accuracy(name, 'fused', one, truth),
+                    accuracy(name, 'fused, best', best(one, fused.vertex_confidence), truth)]
                 found = Found(reconstruction, truth)
                 row, tenth = confidence(name, 'robust', found, regime, settings.min_confidence)
                 scores.append(row)
