@@ -260,14 +260,17 @@ def campaign(name: str, seconds: float, corpus: Path, kept: Path) -> tuple[int, 
             re.findall(r'^#(\d+)', run.stderr, re.M))
         inputs += int(counts[-1]) if counts else 0
         new = sorted(set(kept.glob(f'{name}-*')) - set(found))
-        found += new
-        if new:
-            report = kept / f'report-{new[-1].name}.txt'
+        real = [path for path in new if '-crash-' in path.name or crashes(name, path)]
+        for path in set(new) - set(real):
+            path.unlink()  # watching Python takes memory, the more the longer it runs, and time
+        found += real
+        if real:
+            report = kept / f'report-{real[-1].name}.txt'
             report.write_text(run.stdout + run.stderr)
-            print(f'  {name}: {new[-1]}, explained in {report}', flush=True)
+            print(f'  {name}: {real[-1]}, explained in {report}', flush=True)
         elif not counts:
             raise SystemExit(f'{name} could not be fuzzed:\n{run.stderr[-2000:]}')
-        else:
+        elif not new:
             break
     return inputs, found
 
