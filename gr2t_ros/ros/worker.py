@@ -198,7 +198,8 @@ class Worker:
         :param fields: see Reconstruction.frozen
         :raises Gr2tError: if it was told to stop
         """
-        room = room_for(self._reconstruction.density, fields) if self.views else {}
+        now = self._reconstruction  # the worker may begin another at any moment
+        room = room_for(now.density, fields) if now.views else {}
 
         def freeze() -> Copy:
             with self.timings.measure('copy of the map'):
