@@ -3,7 +3,7 @@
 """What several test files share."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 import hashlib
 import os
 from pathlib import Path
@@ -13,6 +13,7 @@ import pytest
 
 if TYPE_CHECKING:
     from ros_for_tests import Isolation, Observer
+    from worker_for_tests import Rig
 
 PROJECT = Path(__file__).resolve().parents[1]
 DATA = PROJECT.parent / 'shared' / 'data'
@@ -47,3 +48,18 @@ def observer(isolation: Isolation) -> Iterator[Observer]:
     observer = Observer(isolation)
     yield observer
     observer.close()
+
+
+@pytest.fixture(scope='session')
+def plane_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a recording of a plane."""
+    from worker_for_tests import record_plane
+    return record_plane(tmp_path_factory.mktemp('bags') / 'plane')
+
+
+@pytest.fixture
+def make_worker(plane_recording: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
+    """Return a function that makes a running worker with some parameters."""
+    from worker_for_tests import workers
+    with workers(plane_recording, tmp_path / 'snapshots') as make:
+        yield make

@@ -16,7 +16,7 @@ from scenes_for_tests import bumpy_views, plane_view, pose
 
 from gr2t_ros.core.blocks import Blocks
 from gr2t_ros.core.camera import Camera
-from gr2t_ros.core.exact_density import Views
+from gr2t_ros.core.exact_query import Views
 from gr2t_ros.core.frozen import room_for
 from gr2t_ros.core.ray_march import Rays
 from gr2t_ros.core.reconstruction import Keyframe, Reconstruction

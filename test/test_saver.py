@@ -1,33 +1,20 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """Maps outlive the node, and never take another map's file."""
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 import re
 from typing import Any
 
 import pytest
 from test_map_file import assert_same_state
-from worker_for_tests import COUNT, LIMIT, record_plane, Rig, workers
+from worker_for_tests import COUNT, LIMIT, Rig
 
 from gr2t_ros.errors import Gr2tError
 from gr2t_ros.io.map_file import MapFile
 from gr2t_ros.ros import saver
 
 Make = Callable[..., Rig]
-
-
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of a plane."""
-    return record_plane(tmp_path_factory.mktemp('bags') / 'plane')
-
-
-@pytest.fixture
-def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
-    """Return a function that makes a running worker with some parameters."""
-    with workers(bag, tmp_path / 'snapshots') as make:
-        yield make
 
 
 def fed(rig: Rig) -> Rig:
@@ -46,13 +33,13 @@ def load(rig: Rig) -> str:
     return rig.worker.saver.load_map().result(LIMIT)
 
 
-def test_another_node_goes_on_with_the_map(make: Make, tmp_path: Path) -> None:
+def test_another_node_goes_on_with_the_map(make_worker: Make, tmp_path: Path) -> None:
     """It is bit for bit what the first would have had."""
-    first = fed(make(keyframe_translation=0.0))
+    first = fed(make_worker(keyframe_translation=0.0))
     path = save(first)
     assert re.fullmatch(r'map_\d{8}_\d{6}\.gr2t', path.name)
     assert path.parent == tmp_path / 'snapshots'
-    second = make(keyframe_translation=0.0)
+    second = make_worker(keyframe_translation=0.0)
     assert load(second) == f'{path}: {COUNT} views, {COUNT} keyframes'
     assert second.worker.views == COUNT and second.worker.intake.world.frame == 'map'
     assert second.outputs.changed == set(range(COUNT))
@@ -62,9 +49,9 @@ def test_another_node_goes_on_with_the_map(make: Make, tmp_path: Path) -> None:
     assert_same_state(second.worker._reconstruction, first.worker._reconstruction)
 
 
-def test_a_map_is_saved_in_its_own_file(make: Make) -> None:
+def test_a_map_is_saved_in_its_own_file(make_worker: Make) -> None:
     """Again in the same, but never in that of another map: of before a reset, or another node."""
-    rig, other = fed(make()), fed(make())
+    rig, other = fed(make_worker()), fed(make_worker())
     first = save(rig)
     fed(rig)
     assert save(rig) == first and MapFile(first).views == 2 * COUNT
@@ -81,13 +68,13 @@ def test_a_map_is_saved_in_its_own_file(make: Make) -> None:
         2 * COUNT, COUNT, COUNT, COUNT]
 
 
-def test_the_file_may_be_named(make: Make, tmp_path: Path) -> None:
-    rig = fed(make())
+def test_the_file_may_be_named(make_worker: Make, tmp_path: Path) -> None:
+    rig = fed(make_worker())
     path = save(rig)
     path.rename(path.with_name('kitchen.gr2t'))
     fed(rig)
     save(rig)
-    other = make(map_file='kitchen.gr2t')
+    other = make_worker(map_file='kitchen.gr2t')
     assert 'kitchen.gr2t: 5 views' in load(other)
     settings = other.worker._settings
     secret = tmp_path / 'secret.gr2t'
@@ -101,39 +88,39 @@ def test_the_file_may_be_named(make: Make, tmp_path: Path) -> None:
     assert other.worker.views == COUNT, 'the map stays'
 
 
-def test_what_cannot_be_loaded_leaves_the_map(make: Make, tmp_path: Path) -> None:
-    rig = make()
+def test_what_cannot_be_loaded_leaves_the_map(make_worker: Make, tmp_path: Path) -> None:
+    rig = make_worker()
     with pytest.raises(Gr2tError, match='there is no map in'):
         load(rig)
-    path = save(fed(make(depth_bandwidth=0.004)))
+    path = save(fed(make_worker(depth_bandwidth=0.004)))
     fed(rig)
     with pytest.raises(Gr2tError, match=r'depth_bandwidth is 0\.004 there and 0\.003 here'):
         load(rig)
     with pytest.raises(Gr2tError, match="world frame 'map', but this node builds in 'odom'"):
-        load(make(depth_bandwidth=0.004, world_frame='odom'))
+        load(make_worker(depth_bandwidth=0.004, world_frame='odom'))
     path.write_bytes(path.read_bytes()[:-1])
     with pytest.raises(Gr2tError, match='truncated or altered'):
         load(rig)
     assert rig.worker.views == COUNT and rig.outputs.cleared == []
 
 
-def test_maps_are_saved_by_themselves(make: Make, tmp_path: Path) -> None:
+def test_maps_are_saved_by_themselves(make_worker: Make, tmp_path: Path) -> None:
     """Every map_period while there is something new, and at the end."""
-    rig = fed(make(map_period=0.01))
+    rig = fed(make_worker(map_period=0.01))
     rig.wait(lambda: rig.worker.saver._maps.saved == (1, COUNT), 'a map with all frames')
     rig.wait(lambda: rig.said('periodic map: /'), 'that it was written')
     path, = tmp_path.glob('snapshots/*.gr2t')
     rig.worker.stop()
     assert rig.said(f'map: {path}: {COUNT} views')
     assert list(tmp_path.glob('snapshots/*.gr2t')) == [path] and MapFile(path).views == COUNT
-    empty = make(map_period=0.01)
+    empty = make_worker(map_period=0.01)
     empty.worker.stop()
     assert empty.said('map') == 0, 'an empty map is not saved'
 
 
-def test_a_periodic_map_that_cannot_be_written(make: Make, tmp_path: Path) -> None:
+def test_a_periodic_map_that_cannot_be_written(make_worker: Make, tmp_path: Path) -> None:
     (tmp_path / 'snapshots').write_text('a file')
-    rig = fed(make(map_period=0.01))
+    rig = fed(make_worker(map_period=0.01))
     rig.wait(lambda: rig.worker.saver.problem, 'the problem')
     assert 'no periodic map: cannot write to' in rig.worker.saver.problem
     (tmp_path / 'snapshots').unlink()
@@ -142,10 +129,10 @@ def test_a_periodic_map_that_cannot_be_written(make: Make, tmp_path: Path) -> No
 
 
 def test_a_reset_while_a_map_is_written(
-    make: Make, monkeypatch: pytest.MonkeyPatch
+    make_worker: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file is that of the map that was; the next map gets another."""
-    rig = fed(make())
+    rig = fed(make_worker())
     write = saver.save_map
 
     def slow(*arguments: Any, **options: Any) -> Any:
@@ -160,8 +147,8 @@ def test_a_reset_while_a_map_is_written(
     assert save(fed(rig)) != first
 
 
-def test_after_the_end(make: Make) -> None:
-    rig = make()
+def test_after_the_end(make_worker: Make) -> None:
+    rig = make_worker()
     rig.worker.stop()
     for ask in (rig.worker.saver.snapshot, rig.worker.saver.save_map, rig.worker.saver.load_map):
         with pytest.raises(Gr2tError, match='told to stop'):

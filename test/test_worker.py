@@ -1,7 +1,7 @@
 # Copyright 2026 The gr2t_ros developers
 # SPDX-License-Identifier: Apache-2.0
 """The worker without ROS: it is fed with a recording's messages."""
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 import re
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scenes_for_tests import plane_view, pose
-from worker_for_tests import COUNT, LIMIT, record_plane, Rig, workers
+from worker_for_tests import COUNT, LIMIT, Rig
 
 from gr2t_ros.core.camera import Camera
 from gr2t_ros.core.reconstruction import Reconstruction, Update
@@ -26,21 +26,8 @@ from gr2t_ros.tools.recorder import CAMERA_INFO_TOPIC, DEPTH_TOPIC, record
 WALL = 14  # frames
 
 
-@pytest.fixture(scope='module')
-def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a recording of a plane."""
-    return record_plane(tmp_path_factory.mktemp('bags') / 'plane')
-
-
-@pytest.fixture
-def make(bag: Path, tmp_path: Path) -> Iterator[Callable[..., Rig]]:
-    """Return a function that makes a running worker with some parameters."""
-    with workers(bag, tmp_path / 'snapshots') as make:
-        yield make
-
-
-def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> None:
-    rig = make()
+def test_all_frames_are_integrated_and_published(make_worker: Callable[..., Rig]) -> None:
+    rig = make_worker()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.wait(lambda: rig.outputs.published[-1:] and rig.outputs.published[-1][2] == COUNT,
@@ -59,8 +46,8 @@ def test_all_frames_are_integrated_and_published(make: Callable[..., Rig]) -> No
     assert rig.worker.busy > 0
 
 
-def test_a_full_queue_loses_the_oldest_images(make: Callable[..., Rig]) -> None:
-    rig = make(start=False, queue_size=2)
+def test_a_full_queue_loses_the_oldest_images(make_worker: Callable[..., Rig]) -> None:
+    rig = make_worker(start=False, queue_size=2)
     rig.feed()
     assert rig.dropped == {'queue_full': COUNT - 2}
     rig.worker.start()
@@ -71,7 +58,7 @@ def test_a_full_queue_loses_the_oldest_images(make: Callable[..., Rig]) -> None:
 
 
 def test_one_frame_that_fails_costs_itself_only(
-    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add = Reconstruction.add
 
@@ -81,7 +68,7 @@ def test_one_frame_that_fails_costs_itself_only(
         return add(self, view, load)
 
     monkeypatch.setattr(Reconstruction, 'add', fails_once)
-    rig = make()
+    rig = make_worker()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT - 1, 'the other frames')
     assert rig.dropped == {'error': 1}
@@ -89,7 +76,7 @@ def test_one_frame_that_fails_costs_itself_only(
 
 
 def test_what_fails_again_and_again_is_said_while_it_does(
-    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     add, wrong = Reconstruction.add, threading.Event()
 
@@ -99,7 +86,7 @@ def test_what_fails_again_and_again_is_said_while_it_does(
         return add(self, view, load)
 
     monkeypatch.setattr(Reconstruction, 'add', fails)
-    rig = make()
+    rig = make_worker()
     assert rig.worker.failing == ''
     wrong.set()
     rig.feed()
@@ -112,9 +99,9 @@ def test_what_fails_again_and_again_is_said_while_it_does(
     assert rig.worker.failing == ''
 
 
-def test_what_listeners_do_costs_no_frame(make: Callable[..., Rig]) -> None:
+def test_what_listeners_do_costs_no_frame(make_worker: Callable[..., Rig]) -> None:
     """Publishing that fails is logged with its place once, and the frames go on."""
-    rig = make()
+    rig = make_worker()
 
     def broken(*_: Any) -> bool:
         raise OSError('no such publisher')
@@ -128,8 +115,8 @@ def test_what_listeners_do_costs_no_frame(make: Callable[..., Rig]) -> None:
     assert rig.dropped == {}
 
 
-def test_paused_images_are_counted(make: Callable[..., Rig]) -> None:
-    rig = make()
+def test_paused_images_are_counted(make_worker: Callable[..., Rig]) -> None:
+    rig = make_worker()
     rig.worker.intake.pause(True)
     rig.feed()
     assert rig.dropped == {'paused': COUNT}
@@ -138,8 +125,8 @@ def test_paused_images_are_counted(make: Callable[..., Rig]) -> None:
     rig.wait(lambda: rig.integrated == COUNT, 'the frames after the pause')
 
 
-def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
-    rig = make()
+def test_reset_empties_the_map(make_worker: Callable[..., Rig]) -> None:
+    rig = make_worker()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.worker.reset()
@@ -152,7 +139,7 @@ def test_reset_empties_the_map(make: Callable[..., Rig]) -> None:
 
 
 def test_reset_and_pause_do_not_wait_for_a_frame(
-    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What waits when a reset comes is not part of the new map."""
     add, go, busy = Reconstruction.add, threading.Event(), threading.Event()
@@ -163,7 +150,7 @@ def test_reset_and_pause_do_not_wait_for_a_frame(
         return add(self, view, load)
 
     monkeypatch.setattr(Reconstruction, 'add', slow)
-    rig = make()
+    rig = make_worker()
     rig.feed()
     assert busy.wait(LIMIT)
     rig.worker.reset()
@@ -176,8 +163,8 @@ def test_reset_and_pause_do_not_wait_for_a_frame(
     assert rig.outputs.cleared == ['map']
 
 
-def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path) -> None:
-    rig = make()
+def test_every_snapshot_has_a_new_name(make_worker: Callable[..., Rig], tmp_path: Path) -> None:
+    rig = make_worker()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     paths = [rig.worker.saver.snapshot().result(LIMIT).file.path for _ in range(3)]
@@ -188,7 +175,7 @@ def test_every_snapshot_has_a_new_name(make: Callable[..., Rig], tmp_path: Path)
 
 
 def test_no_frame_waits_for_a_snapshot(
-    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
+    make_worker: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames go on while the file is written, which holds the map as it was when asked for."""
     go, busy = threading.Event(), threading.Event()
@@ -198,7 +185,7 @@ def test_no_frame_waits_for_a_snapshot(
         assert go.wait(LIMIT)
         return write_fused(*arguments, **options)
 
-    rig = make(keyframe_translation=0.0)
+    rig = make_worker(keyframe_translation=0.0)
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     monkeypatch.setattr(snapshots, 'write_fused', slow)
@@ -219,7 +206,7 @@ def test_no_frame_waits_for_a_snapshot(
 
 
 def test_a_stop_gives_up_what_is_being_written(
-    make: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    make_worker: Callable[..., Rig], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """No part of a file stays; all who wait are told."""
     busy = threading.Event()
@@ -231,7 +218,7 @@ def test_a_stop_gives_up_what_is_being_written(
         return fuse(self)
 
     monkeypatch.setattr(Reconstruction, 'fuse', slow)
-    rig = make()
+    rig = make_worker()
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     answers = [rig.worker.saver.snapshot(), rig.worker.saver.snapshot()]
@@ -243,8 +230,10 @@ def test_a_stop_gives_up_what_is_being_written(
     assert list(tmp_path.glob('snapshots/*')) == []
 
 
-def test_periodic_snapshots_of_what_is_new(make: Callable[..., Rig], tmp_path: Path) -> None:
-    rig = make(snapshot_period=0.01)
+def test_periodic_snapshots_of_what_is_new(
+    make_worker: Callable[..., Rig], tmp_path: Path,
+) -> None:
+    rig = make_worker(snapshot_period=0.01)
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.wait(lambda: rig.said('periodic snapshot'), 'a snapshot')
@@ -256,9 +245,9 @@ def test_periodic_snapshots_of_what_is_new(make: Callable[..., Rig], tmp_path: P
     assert rig.said('periodic snapshot: /') == len(list(tmp_path.glob('snapshots/*.ply')))
 
 
-def test_parameters_change_while_it_runs(make: Callable[..., Rig]) -> None:
+def test_parameters_change_while_it_runs(make_worker: Callable[..., Rig]) -> None:
     """Depth limits hold for the next images; what the map cannot follow is said."""
-    rig = make(density='voxel', depth_max=5.0)
+    rig = make_worker(density='voxel', depth_max=5.0)
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.outputs.changed.clear()
@@ -272,27 +261,29 @@ def test_parameters_change_while_it_runs(make: Callable[..., Rig]) -> None:
     rig.wait(lambda: rig.said('the map was begun with 5 m'), 'the warning')
 
 
-def test_a_snapshot_on_exit_where_asked(make: Callable[..., Rig], tmp_path: Path) -> None:
+def test_a_snapshot_on_exit_where_asked(make_worker: Callable[..., Rig], tmp_path: Path) -> None:
     for wanted in (False, True):
-        rig = make(snapshot_on_exit=wanted)
+        rig = make_worker(snapshot_on_exit=wanted)
         rig.feed()
         rig.wait(lambda rig=rig: rig.integrated == COUNT, 'all frames')
         rig.worker.stop()
         assert len(list(tmp_path.glob('snapshots/*.ply'))) == wanted
 
 
-def test_a_folder_that_cannot_be_made_is_named(make: Callable[..., Rig], tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_named(
+    make_worker: Callable[..., Rig], tmp_path: Path,
+) -> None:
     (tmp_path / 'file').write_text('')
-    rig = make(snapshot_directory=str(tmp_path / 'file' / 'inside'))
+    rig = make_worker(snapshot_directory=str(tmp_path / 'file' / 'inside'))
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     with pytest.raises(Exception, match='file/inside'):
         rig.worker.saver.snapshot().result(LIMIT)
 
 
-def test_images_whose_pose_never_comes_are_given_up(make: Callable[..., Rig]) -> None:
+def test_images_whose_pose_never_comes_are_given_up(make_worker: Callable[..., Rig]) -> None:
     """Also when no more messages arrive; the reason is said once."""
-    rig = make(max_wait_for_pose=0.05)
+    rig = make_worker(max_wait_for_pose=0.05)
     rig.feed(DEPTH_TOPIC, CAMERA_INFO_TOPIC, '/tf_static')
     rig.wait(lambda: sum(rig.dropped.values()) == COUNT, 'the images to be given up')
     (reason, count), = rig.dropped.items()
@@ -314,9 +305,9 @@ def path_along_a_wall(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_leaves_memory_is_in_the_snapshots_folder(
-    make: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
+    make_worker: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
 ) -> None:
-    rig = make(bag=path_along_a_wall, max_keyframes=9, depth_max=0.9, queue_size=WALL)
+    rig = make_worker(bag=path_along_a_wall, max_keyframes=9, depth_max=0.9, queue_size=WALL)
     rig.feed()
     rig.wait(lambda: rig.integrated == WALL, 'all frames')
     rig.wait(lambda: rig.worker.parts.keyframes == WALL - 9, 'those far away to leave')
@@ -342,10 +333,10 @@ def test_what_leaves_memory_is_in_the_snapshots_folder(
 
 
 def test_frames_are_refused_where_nothing_can_leave_memory(
-    make: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
+    make_worker: Callable[..., Rig], path_along_a_wall: Path, tmp_path: Path
 ) -> None:
     (tmp_path / 'file').write_text('')
-    rig = make(
+    rig = make_worker(
         bag=path_along_a_wall, max_keyframes=9, depth_max=0.9, queue_size=WALL,
         snapshot_directory=str(tmp_path / 'file' / 'inside'))
     rig.feed()
@@ -355,9 +346,9 @@ def test_frames_are_refused_where_nothing_can_leave_memory(
     assert rig.said('[memory: said once, then counted]') == 1
 
 
-def test_rays_that_wait_are_marched_when_idle(make: Callable[..., Rig]) -> None:
+def test_rays_that_wait_are_marched_when_idle(make_worker: Callable[..., Rig]) -> None:
     """Without time for older rays while frames come, the map is complete soon after."""
-    rig = make(remarch_budget=0.0, keyframe_translation=0.0)
+    rig = make_worker(remarch_budget=0.0, keyframe_translation=0.0)
     rig.feed()
     rig.wait(lambda: rig.integrated == COUNT, 'all frames')
     rig.wait(lambda: rig.worker.waiting_rays == 0, 'the older rays')

@@ -18,7 +18,7 @@ from numba import njit
 import numpy as np
 from numpy.typing import NDArray
 
-from . import exact_density, voxel_query
+from . import exact_query, voxel_query
 from .climb import aim, INTERVAL, Status
 from .compiled import run_all
 from .exact_density import ExactDensity
@@ -221,7 +221,7 @@ def watched_blocks(
 
 def _kernels(density: Density) -> ModuleType:
     """Return the module whose march_rays and changed_rays take the density's state."""
-    return voxel_query if isinstance(density, VoxelDensity) else exact_density
+    return voxel_query if isinstance(density, VoxelDensity) else exact_query
 
 
 def _over_chunks(pool: Executor | None, count: int, task: Callable[[slice], None]) -> None:
