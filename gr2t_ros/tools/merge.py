@@ -58,9 +58,7 @@ def run(args: argparse.Namespace) -> int:
             for path in args.maps[1:]:
                 _add(path, reconstruction, settings)
             for update in march_waiting(reconstruction):
-                done.marched += update.marched
-                done.remarched += update.remarched
-                done.converged += update.converged
+                done.count(update)
             done.read = done.integrated = reconstruction.views
             done.keyframes = len(reconstruction.keyframes)
             title = ' + '.join(path.name for path in args.maps)

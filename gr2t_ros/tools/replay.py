@@ -266,9 +266,7 @@ class _Replay:
         done.integrated += 1
 
     def _count(self, update: Update) -> None:
-        self._done.marched += update.marched
-        self._done.remarched += update.remarched
-        self._done.converged += update.converged
+        self._done.count(update)
         for notice in update.notices:
             say(notice)
         if update.released and not self._said:

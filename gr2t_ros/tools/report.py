@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from ..core.next_views import NextView
+from ..core.reconstruction import Update
 from ..io.files import whole_file
 from ..io.parts import Parts
 from ..settings import Settings
@@ -56,6 +57,12 @@ class Run:
     last_stamp_ns: int = 0
     input_damage: str = ''
     next_views: tuple[NextView, ...] = ()
+
+    def count(self, update: Update) -> None:
+        """Add the rays that a step marched."""
+        self.marched += update.marched
+        self.remarched += update.remarched
+        self.converged += update.converged
 
 
 def report(run: Run, counts: Mapping[str, int], likelihood: ArrayLike) -> dict[str, Any]:
