@@ -74,6 +74,7 @@ def test_an_image_of_either_endianness_with_padded_rows(
     height=ANY_INT, width=ANY_INT, step=ANY_INT, encoding=strategies.sampled_from(
         ['16UC1', 'mono16', '32FC1', 'rgb8', '', '\0']) | strategies.text(max_size=5),
     data=strategies.binary(max_size=200), big=strategies.integers(0, 255))
+@example(height=-1, width=-1, step=0, encoding='16UC1', data=b'', big=0)
 @examples
 def test_images_of_any_numbers_are_read_or_refused(
     height: int, width: int, step: int, encoding: str, data: bytes, big: int

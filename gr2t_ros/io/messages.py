@@ -169,7 +169,7 @@ def mask(msg: Any) -> NDArray[np.bool_]:
     if msg.encoding not in ('mono8', '8UC1'):
         raise FrameError(
             'mask', f'the mask has encoding {str(msg.encoding)[:40]!r}; mono8 and 8UC1 are known')
-    if not 0 < height * width <= depth_codecs.MAX_PIXELS or step < width or (
+    if height <= 0 or width <= 0 or height * width > depth_codecs.MAX_PIXELS or step < width or (
             len(msg.data) < step * (height - 1) + width):
         raise FrameError('mask', f'the mask of {width}x{height} pixels with step {step} has '
                          f'{len(msg.data)} bytes of data: its publisher writes wrong headers')
